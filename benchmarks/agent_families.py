@@ -56,7 +56,7 @@ class Family:
 
         PPO trains for whole learning phases, at least two of them.
         """
-        proxy = SyntheticConfig()  # that of `preset=best` is of one-step episodes
+        proxy = SyntheticConfig(initial_state="real", horizon=None, done="soft")  # the paper's
         if self.settings == "best" or self.agent == "ddqn":
             names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
             chosen = sejax.config(names)
@@ -66,7 +66,7 @@ class Family:
         elif self.agent == "ppo":
             agent = sejax.PPOConfig.paper()
         else:
-            agent = registry.configure("agent", {"name": self.agent})
+            agent = registry.configure("agent", {"name": self.agent, **PAPERS.get(self.agent, {})})
         agent = replace(agent, warmup_episodes=0)
         limit = registry.configure("env", {"name": self.env}).spec.max_steps
         phase = agent.steps_before_learning(limit, limit)  # 0 but for PPO
@@ -75,6 +75,13 @@ class Family:
         return agent, proxy, training
 
 
+_LAYERS = {"hidden_size": 128, "num_layers": 2}
+PAPERS: dict[str, dict[str, Any]] = {  # the paper's default agents
+    "dueling_ddqn": _LAYERS
+    | {"batch_size": 128, "exploration_steps": None, "feature_dim": 128, "stream_hidden_size": 128},
+    "td3_discrete": _LAYERS | {"batch_size": 128, "learning_rate": 5e-4},
+    "td3": _LAYERS | {"batch_size": 256, "learning_rate": 3e-4, "tau": 0.005},
+}
 WITH_REFERENCE = [
     Family(agent="ddqn", env="cartpole", reference="torch_reference"),
     Family(agent="td3", env="pendulum", reference="torch_reference_td3"),

@@ -80,10 +80,11 @@ def main() -> None:
     sejax.configure_xla()  # a device for each core
     task = make_reacher(size=3)
     agent = sejax.make_agent(sejax.TD3Config(
-        warmup_episodes=1, batch_size=64, hidden_size=64, num_layers=1, learning_rate=3e-3,
+        tau=0.005,
     ), task)  # fmt: skip
     learn = sejax.make_learner(
-        task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=32, done="threshold"),
+        task=task, agent=agent,
+        proxy=sejax.SyntheticConfig(hidden_size=32, initial_state="real", horizon=None),
         es=sejax.NESConfig(population_size=args.population, noise_std=0.1, noise_std_decay=1.0,
                            num_incumbent_evals=args.population),
         training=sejax.TrainingConfig(max_steps=args.steps, stop_rule="never"),

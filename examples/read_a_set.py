@@ -25,7 +25,7 @@ ES = sejax.NESConfig(population_size=16, num_incumbent_evals=16, noise_std=0.1, 
 def learn_a_set(path: Path, size: int, generations: int) -> None:
     """Learns synthetic environments of a small grid from several seeds at once."""
     task = sejax.envs.make("gridworld_2x2")
-    proxy = sejax.SyntheticConfig(hidden_size=16, done="threshold").make(task)
+    proxy = sejax.SyntheticConfig(hidden_size=16, initial_state="real", horizon=None).make(task)
     agent = sejax.make_agent(AGENT, task)
     learn = sejax.make_learner(
         task=task, agent=agent, proxy=proxy, es=ES, devices=1,

@@ -52,6 +52,7 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
+    "agent_of": "sejax.proxies.io",
     "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
@@ -100,6 +101,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.proxies.io import (
         Proxy,
         ProxySet,
+        agent_of,
         load,
         load_proxy,
         load_set,
@@ -148,6 +150,7 @@ __all__ = [
     "Task",
     "TrainResult",
     "TrainingConfig",
+    "agent_of",
     "agents",
     "config",
     "configure_xla",

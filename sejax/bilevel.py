@@ -250,7 +250,7 @@ def make_bilevel(
       task: the real task.
       agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
         mixture of agents (`sejax.Mixture`), among which the candidates are divided.
-      proxy, es, objective: by default an SE of whole episodes (`SyntheticConfig()`), NES
+      proxy, es, objective: by default a one-step SE (`SyntheticConfig()`), NES
         (`NESConfig()`), and the mean test return.
       training: how long each agent trains, and how it is tested.
       stop_when_solved: whether a run ends at its first incumbent mean that solves the task.

@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # which takes 0.3 s to import
 
 ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
 
+Without agent=NAME they are those that the proxy was learned with.
+
   python -m sejax.evaluate proxy=RUN_DIR num_agents=20
   python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
 
@@ -43,7 +45,8 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, overrides)}"
+    words = configuration.with_learned(overrides)
+    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, words)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:

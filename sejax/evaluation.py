@@ -5,6 +5,7 @@ Agents".
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, overload
@@ -21,6 +22,7 @@ from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
 from sejax.es.base import StrategyState
 from sejax.objectives import Outcome
+from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import (
@@ -265,8 +267,7 @@ def make_evaluator(
     Example:
       >>> import sejax
       >>> env, params = sejax.load("cartpole")
-      >>> agent = sejax.make_agent(sejax.DDQNConfig(warmup_episodes=1), env.task)
-      >>> training = sejax.TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
+      >>> agent, training = sejax.agent_of(env), sejax.training_of(env)
       >>> evaluate = make_evaluator(agent, env, env.task, training)
       >>> outcome = jax.eval_shape(evaluate, jax.random.key(0), params)
       >>> outcome.test_returns.shape
@@ -387,22 +388,47 @@ def evaluate_agents(
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
-    `env, env_params` are what `sejax.load` returns, `task` the real one.
+    `env, env_params` are what `sejax.load` returns, `task` the real one. It compiles once for equal
+    arguments; `env_params` may differ, and `keys` in their values. The numbers are those of
+    `jax.vmap(make_evaluator(...))` up to rounding: a program of another width adds in another
+    order, and in a training a last bit grows.
 
-    It compiles at every call: in a loop, jit `make_evaluator` yourself. `on_done` is called from
-    the program's threads as each agent ends, also for copies that fill up the last batch. The
-    numbers are the same with it, but jax does not cache a compiled program that calls back.
+    `on_done` is called from the program's threads as each agent ends, also for copies that fill up
+    the last batch. The numbers are the same with it, but it compiles for each such function, and
+    jax keeps no program on disk that calls back.
     """
+    env = env.bare if isinstance(env, ProxyEnv) else env
+    program = _evaluation_program(agent, env, task, training, num_parallel, devices, on_done)
+    return program(keys, env_params)
+
+
+@functools.lru_cache(maxsize=64)
+def _evaluation_program(
+    agent: Agent,
+    env: Any,
+    task: Task,
+    training: TrainingConfig,
+    num_parallel: int | None,
+    devices: int | None,
+    on_done: Callable[[], None] | None,
+) -> Callable[[Array, PyTree], Outcome]:
+    """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
     evaluate = make_evaluator(agent, env, task, training)
 
-    def one(key: Array) -> Outcome:
-        outcome: Outcome = evaluate(key, env_params)
-        if on_done is not None:
-            jax.debug.callback(lambda _: on_done(), outcome.test_return)
-        return outcome
+    def program(keys: Array, env_params: PyTree) -> Outcome:
+        def one(key: Array) -> Outcome:
+            outcome: Outcome = evaluate(key, env_params)
+            if on_done is not None:
+                jax.debug.callback(lambda _: on_done(), outcome.test_return)
+            return outcome
 
-    program = spread_over_devices(one, devices, num_parallel, num_parallel_on_cpu(agent, training))
-    return jax.jit(program, compiler_options=compiler_options())(keys)
+        width = num_parallel_on_cpu(agent, training)
+        if width is not None:
+            width = min(width, cpu.width_of(keys.shape[0]))
+        spread: Outcome = spread_over_devices(one, devices, num_parallel, width)(keys)
+        return spread
+
+    return jax.jit(program, compiler_options=compiler_options())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,9 +32,9 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import from_plain
-from sejax.proxies.base import episode_limit, is_real, prepare
+from sejax.proxies.base import ProxyEnv, episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
-from sejax.proxies.io import Proxy, ProxySet, stored_config
+from sejax.proxies.io import Proxy, ProxySet, stored_env
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -42,16 +42,19 @@ SOLVED_BY = ("test", "train")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig(Options):
-    """How long an agent trains, and how it is tested."""
+    """How long an agent trains, and how it is tested.
+
+    The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`.
+    """
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e: of a training at most
+    max_episodes: int = option(2000, counts("it counts episodes"))  # n_e: of a training at most
     # The stop rule waits for so many training steps.
     min_steps: int = option(0, counts("it counts steps", least=0))
     # Training ends after so many steps, whatever the rule says.
-    max_steps: int | None = option(None, counts("an agent must train"))
-    stop_rule: str = option("plateau", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
+    max_steps: int | None = option(2000, counts("an agent must train"))
+    stop_rule: str = option("never", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
     # d: episodes in each of the two means that the plateau rule compares
     window: int = option(10, counts("it counts episodes"))
     # C_diff: relative change between them that counts as flat
@@ -116,11 +119,13 @@ def budget_for(
     )
 
 
-def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> TrainingConfig:
+def training_of(
+    proxy: ProxyEnv | Proxy | ProxySet, agent: AgentConfig | None = None
+) -> TrainingConfig:
     """How long agents trained on a stored proxy when it was learned.
 
     Args:
-      proxy: from `sejax.load_proxy` or `sejax.load_set`.
+      proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
       agent: configuration of another agent that is to train on it, whose budget is then that of
         `budget_for`; None for the training as it was.
 
@@ -132,12 +137,12 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
       >>> training_of(sejax.load_proxy("cartpole")).stop_rule
       'never'
     """
-    config = stored_config(proxy)
+    env, config = stored_env(proxy)
     stored: Any = config.get("training")
     require(
         isinstance(stored, Mapping),
         "training",
-        f"must be given for {shortened(proxy.path.name)}, which does not say how long its agents "
+        f"must be given for {shortened(env.name)}, which does not say how long its agents "
         "trained; got none. Set training=sejax.TrainingConfig(...).",
     )
     training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
@@ -148,7 +153,7 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
         for values in agents_of(config).values()
         if is_registered("agent", values)
     ]
-    return budget_for(training, agent, known, proxy.env.max_steps, proxy.env.task.max_steps)
+    return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
 
 
 def require_training_config(training: Any) -> None:

@@ -8,6 +8,20 @@ import jax
 import numpy as np
 from PIL import Image
 
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
+
+
+def paper_se(**fields):
+    """The paper's SE, of whole episodes, but for these fields."""
+    return SyntheticConfig(**{"initial_state": "real", "horizon": None, "done": "soft"} | fields)
+
+
+def paper_training(**fields):
+    """The paper's training, which ends by its returns, but for these fields."""
+    paper = {"max_steps": None, "max_episodes": 1000, "stop_rule": "plateau"}
+    return TrainingConfig(**paper | fields)
+
 
 def shapes_of(fn, *args):
     """What `fn(*args)` returns, as zeros in NumPy; nothing is compiled."""

@@ -16,7 +16,7 @@ from sejax import envs
 from sejax.cli import commands, preset_files
 from sejax.cli import config as configuration
 from sejax.cli.compose import expand
-from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, plain
+from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, members_of, plain
 from sejax.options import ConfigError, registry
 from sejax.options.plain import flatten, parsed
 
@@ -172,9 +172,34 @@ def test_each_agent_of_a_mixture_has_the_settings_that_it_has_alone(preset):
 def test_evaluate_takes_a_mixture_and_the_agent_of_the_proxys_task():
     config = evaluate_config(["proxy=cartpole", "agents=[ddqn,ppo]", "agents.ppo.epochs=3"])
     assert [x.key for x in config.agents.members] == ["ddqn", "ppo"]
-    assert evaluate_config(["proxy=pendulum"]).agent == sejax.TD3Config()
-    assert evaluate_config(["proxy=cliff_walking-rn"]).agent == sejax.QLearningConfig()
+    default = "agent_hparams=default"
+    assert evaluate_config(["proxy=pendulum", default]).agent == sejax.TD3Config()
+    assert evaluate_config(["proxy=cliff_walking-rn", default]).agent == sejax.QLearningConfig()
     assert evaluate_config(["proxy=real", "env=acrobot"]).real_training.stop_rule == "solved"
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-rn", "cliff_walking-rn"])
+def test_evaluate_trains_the_agents_that_a_proxy_was_learned_with(name):
+    config = evaluate_config([f"proxy={name}"])
+    learned = sejax.load_proxy(name).learned_agents()
+    assert {x.key: x.agent for x in members_of(config)} == learned
+    assert config.agent_hparams == "as_learned"
+    for key, agent in learned.items():  # as one that is named, too
+        assert evaluate_config([f"proxy={name}", f"agent={key}"]).agent == agent
+        changed = evaluate_config([f"proxy={name}", f"agent={key}", "agent.discount=0.5"]).agent
+        assert changed == dataclasses.replace(agent, discount=0.5)
+        default = evaluate_config([f"proxy={name}", f"agent={key}", "agent_hparams=default"])
+        assert default.agent == type(agent)()
+
+
+def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():
+    learned = sejax.load_proxy("cartpole").learned_agents()
+    config = evaluate_config(["proxy=cartpole", "agents=[ppo,sac]", "agents.ppo.epochs=3"])
+    ppo, sac = (x.agent for x in config.agents.members)
+    assert (ppo, sac) == (dataclasses.replace(learned["ppo"], epochs=3), sejax.SACConfig())
+    assert config.agent_hparams == "default"
+    config = evaluate_config(["proxy=cartpole", "agent.discount=0.5"])  # of the task's own agent
+    assert config.agent == dataclasses.replace(learned["ddqn"], discount=0.5)
 
 
 # --- sweeps ---------------------------------------------------------------------------------------

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import paper_training
 
 from sejax import envs
 from sejax.agents.buffers import Transition
 from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
 from sejax.evaluation import make_tester
-from sejax.training import TrainingConfig, make_trainer
+from sejax.training import make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
@@ -91,7 +92,7 @@ def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bo
     task = envs.make("cliff_walking")
     plain = make_tabular(QLearningConfig(warmup_episodes=2), 48, 4)
     agent = counting(plain, 0.1, 48, 4)
-    config = TrainingConfig(max_episodes=200, stop_rule="never")
+    config = paper_training(max_episodes=200, stop_rule="never")
     train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)
 
     @jax.jit

@@ -11,7 +11,7 @@ import jax
 import pandas as pd
 import pytest
 from rich.console import Console
-from support import is_drawn
+from support import is_drawn, paper_se, paper_training
 
 import sejax
 from sejax import envs
@@ -24,7 +24,7 @@ from sejax.cli.worlds import proxy_setup
 from sejax.evaluate import evaluate, summarise
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
-from sejax.training import TrainingConfig, budget_for
+from sejax.training import budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
@@ -174,7 +174,7 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     assert budget(then) == 50  # nobody knows what it was learned with
     # Of several that it was learned with, the one that waits longest counts.
     assert budget(long, then, short) == 50 + 200
-    unlimited = TrainingConfig()
+    unlimited = paper_training()
     assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
     # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
     assert budget_for(training, long, [then], 1, 200).max_steps == 50 + 401
@@ -202,18 +202,17 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
              "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
     composed = evaluate_config(f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]",
+                               "agents.dueling_ddqn.warmup_episodes=10",
                                "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
         for key, training in proxy_setup(composed).worlds["the proxy"][2].items()
     }
-    # Learned with 4000 steps, of which DDQN waits 2 * 200; here 10 episodes, as PPO collects.
-    waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
+    # Learned with 4000 steps, of which DDQN waits 2 * 200; others wait 10 episodes.
+    waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
-    assert as_learned.members == tuple(
-        dataclasses.replace(x, field="agent", weight=1.0) for x in members_of(learned(*words)[0])
-    )
+    assert as_learned.members == members_of(learned(*words)[0])
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
     with pytest.raises(ConfigError, match=r"^agent must be a registered"):
         sejax.load_proxy(path).learned_with("agent")
@@ -342,9 +341,11 @@ def test_agents_that_do_not_suit_the_task_are_refused(room):
 def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     """Also for a stranger's task, which is not imported: what agents see is in the file."""
     task = dataclasses.replace(envs.make("pendulum"), name="theirs", origin={"name": "their:Task"})
-    env = sejax.SyntheticConfig(hidden_size=4, initial_state="learned", horizon=1).make(task)
+    env = paper_se(hidden_size=4, initial_state="learned", horizon=1).make(task)
     sejax.save(tmp_path / "theirs.safetensors", env, env.init_weights(jax.random.key(0)))
-    for proxy, kind in ((room, "q_learning"), ("pendulum", "td3"), ("acrobot", "ddqn"),
+    own = "agent_hparams=default"
+    for proxy, kind in ((room, "q_learning"), (f"pendulum {own}", "td3"),
+                        (f"acrobot {own}", "ddqn"),
                         (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
                         ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
         config = evaluate_config(*f"proxy={proxy}".split(), words=[])

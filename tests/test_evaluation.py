@@ -6,15 +6,17 @@ import jax
 import jax.numpy as jnp
 import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
+from support import paper_se, paper_training
 
 import sejax
 from sejax import envs, evaluation
-from sejax.options import registry
-from sejax.proxies.configs import RewardConfig, SyntheticConfig
+from sejax.evaluation import _evaluation_program
+from sejax.options import ConfigError, registry
+from sejax.proxies.configs import RewardConfig
 from sejax.training import TrainingConfig
 
 ENV = ScriptedEnv()
-TRAINING = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
+TRAINING = paper_training(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
 
 
 def test_tests_between_are_as_many_as_asked_and_the_area_is_over_all_steps():
@@ -62,13 +64,13 @@ def test_an_outcome_counts_training_and_tests():
 
 
 @pytest.mark.parametrize(("env", "agent", "exploration", "varied", "proxy"), [
-    ("pendulum", "td3", "none", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "td3", "none", False, paper_se(hidden_size=2)),
     ("pendulum", "td3", "icm", False, RewardConfig(hidden_size=2)),
-    ("pendulum", "sac", "icm", False, SyntheticConfig(hidden_size=2)),
-    ("pendulum", "ppo", "icm", False, SyntheticConfig(hidden_size=2)),
-    ("cartpole", "td3_discrete", "none", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "sac", "icm", False, paper_se(hidden_size=2)),
+    ("pendulum", "ppo", "icm", False, paper_se(hidden_size=2)),
+    ("cartpole", "td3_discrete", "none", False, paper_se(hidden_size=2)),
     ("cartpole", "ddqn", "icm", False, RewardConfig(hidden_size=2)),
-    pytest.param("pendulum", "sac", "icm", True, SyntheticConfig(hidden_size=2),
+    pytest.param("pendulum", "sac", "icm", True, paper_se(hidden_size=2),
                  marks=pytest.mark.slow),  # which is traced for every size that may be drawn
     pytest.param("cartpole", "ddqn", "icm", True, RewardConfig(hidden_size=2),
                  marks=pytest.mark.slow),
@@ -85,3 +87,33 @@ def test_every_kind_of_agent_can_be_trained_on_every_kind_of_proxy(
     evaluate = evaluation.make_evaluator(made, world, task, training)
     outcome = jax.eval_shape(lambda key: evaluate(key, world.default_params), jax.random.key(0))
     assert outcome.test_returns.shape == (3,)
+
+
+def test_agents_are_those_that_a_stored_proxy_was_learned_with():
+    for source in ("cartpole", "cliff_walking-rn"):
+        proxy = sejax.load_proxy(source)
+        for key, config in proxy.learned_agents().items():
+            assert sejax.agent_of(proxy.env, key) is sejax.make_agent(config, proxy.task)
+        assert sejax.agent_of(proxy) is sejax.agent_of(
+            proxy.env, next(iter(proxy.learned_agents()))
+        )
+        assert sejax.training_of(proxy.env) == sejax.training_of(proxy)
+    with pytest.raises(ConfigError, match=r"^name must be .*q_learning"):
+        sejax.agent_of(proxy, "ddqn")
+    with pytest.raises(ConfigError, match=r"^proxy must be a stored one"):
+        sejax.agent_of(proxy.env.bare)
+
+
+def test_equal_arguments_compile_once():
+    keys = jax.random.split(jax.random.key(0), 4)
+    before = _evaluation_program.cache_info()
+    for factor in (1.0, 2.0):
+        env, params = sejax.load("cliff_walking-rn")
+        params = params.replace(weights=jax.tree.map(lambda x, f=factor: f * x, params.weights))
+        training = TrainingConfig(max_steps=30, test_episodes=1)
+        agent = sejax.agent_of(env)
+        sejax.evaluate_agents(agent, env, params, env.task, training, keys, devices=1)
+    after = _evaluation_program.cache_info()
+    assert (after.misses - before.misses, after.hits - before.hits) == (1, 1)
+    program = _evaluation_program(agent, env.bare, env.task, training, None, 1, None)
+    assert program._cache_size() == 1

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import random_like, shapes_of
+from support import paper_training, random_like, shapes_of
 
 import sejax
 
@@ -234,7 +234,7 @@ def test_sac_learns_pendulum(examples):
     own_agent = examples("own_agent")
     task = sejax.envs.make("pendulum")
     agent = sejax.make_agent(own_agent.SAC(), task)
-    training = sejax.TrainingConfig(stop_rule="never", max_steps=15_000)
+    training = paper_training(stop_rule="never", max_steps=15_000)
     keys = jax.random.split(jax.random.key(7), 6)
     outcome = sejax.evaluate_agents(agent, task.env, task.params, task, training, keys)
     assert (outcome.test_return > -300).sum() >= 4

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import t as student
-from support import refuse
+from support import paper_se, refuse
 from test_experiments import save_ses
 
 import sejax
@@ -73,7 +73,7 @@ def test_sets_are_summarised_over_their_ses_and_share_those_that_are_in_both():
 @pytest.mark.slow
 def test_a_discount_that_is_traced_is_that_of_the_configuration():
     task = sejax.envs.make("cartpole")
-    env = sejax.SyntheticConfig(hidden_size=4).make(task)
+    env = paper_se(hidden_size=4).make(task)
     training = sejax.TrainingConfig(max_steps=40, max_episodes=40, stop_rule="never")
     config = sejax.DDQNConfig(hidden_size=4, batch_size=4, num_layers=1, warmup_episodes=0)
     key, params = jax.random.key(3), env.params(env.init_weights(jax.random.key(5)), 0.99)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from support import refuse
+from support import paper_training, refuse
 from test_experiments import TINY, TINY_AGENT, save_ses
 
 import sejax
@@ -231,7 +231,7 @@ def check_as_evaluation(ses, rows):
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
     mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
-    training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
+    training = paper_training(max_steps=40, stop_rule="never", test_episodes=2)
     chosen, expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
     np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])

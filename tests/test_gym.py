@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TransformObservation
-from support import random_like, shapes_of
+from support import paper_se, random_like, shapes_of
 
 import sejax
 from sejax import envs
@@ -22,7 +22,6 @@ from sejax.gym.networks import shapes_of as shapes_of_networks
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import find, pretrained_names
 
 KEY = jax.random.key(0)
@@ -31,7 +30,7 @@ BANDIT = {"initial_state": "learned", "horizon": 1, "done": "threshold"}
 
 
 def jax_se(task="cartpole", **config):
-    return registry.make("proxy", SyntheticConfig(**SMALL | config), envs.make(task))
+    return registry.make("proxy", paper_se(**SMALL | config), envs.make(task))
 
 
 def random_weights(env, seed=0, scale=0.5):
@@ -52,7 +51,7 @@ def stored(tmp_path):
 
 def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
     """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
-    config = SyntheticConfig(**SMALL | {"done": "threshold"} | config)
+    config = paper_se(**SMALL | {"done": "threshold"} | config)
     shapes = shapes_of_networks(config.networks(obs_dim=4, action_dim=2))
     weights = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     for head, value in {"state": state, "reward": reward, "done": d}.items():
@@ -317,7 +316,7 @@ def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
 @pytest.mark.parametrize("name", ["by hand", "a(b)/c", "@"])
 def test_a_task_may_be_called_what_gymnasium_would_not(stored, name):
     task = dataclasses.replace(envs.make("cartpole"), name=name, origin=None)
-    env = make(stored(registry.make("proxy", SyntheticConfig(**SMALL, **BANDIT), task)))
+    env = make(stored(registry.make("proxy", paper_se(**SMALL, **BANDIT), task)))
     assert gymnasium.make(env.spec).reset(seed=0)[0].shape == (4,)
 
 
@@ -396,7 +395,7 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
 def test_a_task_of_gymnax_is_gymnasiums_of_that_id(stored, given, limit):
-    jax_env = SyntheticConfig(**SMALL).make(envs.make("gymnax/MountainCar-v0", **given))
+    jax_env = paper_se(**SMALL).make(envs.make("gymnax/MountainCar-v0", **given))
     env = make(stored(jax_env))
     assert env.action_space == spaces.Discrete(3) and env.world.max_steps == limit
     (position, velocity), _ = env.reset(seed=0)
@@ -411,7 +410,7 @@ def test_an_unknown_task_must_be_given(stored):
     from gymnax.environments.classic_control import pendulum
 
     task = sejax.Task(name="mine", env=pendulum.Pendulum(), max_steps=7)
-    path = stored(registry.make("proxy", SyntheticConfig(**SMALL, done="bernoulli"), task))
+    path = stored(registry.make("proxy", paper_se(**SMALL, done="bernoulli"), task))
     box = spaces.Box(-2, 2, (1,))
     mine = RealTask(observation_space=spaces.Box(-8, 8, (3,)), action_space=box, max_steps=7)
     assert refused(make, path) == "task"
@@ -430,7 +429,7 @@ def test_an_unknown_task_must_be_given(stored):
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
     task = dataclasses.replace(envs.make("pendulum"), name="mine", origin=None)
-    config = SyntheticConfig(**SMALL, initial_state="learned", state_units="bounds")
+    config = paper_se(**SMALL, initial_state="learned", state_units="bounds")
     path = stored(registry.make("proxy", config, task))
     env, given = make(path), make(path, "Pendulum-v1")
     assert (env.action_space, env.observation_space) == (given.action_space, spaces.Box(
@@ -489,19 +488,19 @@ def test_weights_that_are_not_the_networks_are_refused_as_in_jax(tmp_path, chang
 
 
 def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    env = registry.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole"))
+    env = registry.make("proxy", paper_se(**SMALL), envs.make("cartpole"))
     path = stored(env)
     assert make(path).world.max_steps == make(path, "CartPole-v1").world.max_steps == 200
     task = RealTask.of_gymnasium("CartPole-v1")
     assert refused(make, path, task) == "task"
     assert make(path, dataclasses.replace(task, max_steps=200)).world.max_steps == 200
-    bandit = stored(registry.make("proxy", SyntheticConfig(**SMALL, horizon=1),
+    bandit = stored(registry.make("proxy", paper_se(**SMALL, horizon=1),
                                  envs.make("cartpole")))  # fmt: skip
     assert make(bandit, task).world.max_steps == 1  # whatever the task's
 
 
 def test_starts_are_as_the_environments_wrappers_show_them(stored):
-    path = stored(registry.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole")))
+    path = stored(registry.make("proxy", paper_se(**SMALL), envs.make("cartpole")))
     real = gymnasium.make("CartPole-v1", max_episode_steps=200)
     wrapped = TransformObservation(real, lambda obs: 10 * obs, real.observation_space)
     se = make(path, RealTask.of_env(wrapped))

@@ -6,13 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from support import random_like
+from support import paper_se, random_like
 
 from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.gym.networks import shapes_of
 from sejax.gym.vector import PREFETCHED
 from sejax.options import ConfigError
-from sejax.proxies.configs import SyntheticConfig
 
 TASKS = {"cartpole": RealTask.of_gymnasium("CartPole-v1", 4),
          "pendulum": RealTask.of_gymnasium("Pendulum-v1", 3)}  # fmt: skip
@@ -21,7 +20,7 @@ MODES = ["NextStep", "SameStep", "Disabled"]
 
 def world_of(task="cartpole", **config):
     """An SE of random weights."""
-    config = SyntheticConfig(hidden_size=5, **{"done": "threshold"} | config)
+    config = paper_se(hidden_size=5, **{"done": "threshold"} | config)
     obs_dim, action_dim = {"cartpole": (4, 2), "pendulum": (3, 1)}[task]
     shapes = shapes_of(config.networks(obs_dim, action_dim))
     like = {name: np.zeros(shape) for name, shape in shapes.items()}

@@ -13,6 +13,7 @@ from gymnax.environments import spaces
 from gymnax.environments.classic_control import cartpole
 from gymnax.registration import registered_envs
 from gymnax.wrappers.purerl import StickyActionWrapper
+from support import paper_se
 
 import sejax
 from sejax import envs
@@ -90,7 +91,7 @@ def test_agents_train_on_them_and_on_their_proxies(gymnax_id):
         config = sejax.DDQNConfig(hidden_size=2, num_layers=1, batch_size=2, warmup_episodes=0)
     agent = sejax.make_agent(config, task)
     training = sejax.TrainingConfig(max_episodes=2, max_steps=9, stop_rule="never")
-    for proxy in (sejax.SyntheticConfig(hidden_size=2), sejax.RewardConfig(hidden_size=2)):
+    for proxy in (paper_se(hidden_size=2), sejax.RewardConfig(hidden_size=2)):
         env = registry.make("proxy", proxy, task)
         evaluate = sejax.make_evaluator(agent, env, task, training)
         outcome = jax.eval_shape(lambda key: evaluate(key, env.default_params), KEY)  # noqa: B023
@@ -122,7 +123,7 @@ def test_limit_and_threshold_are_those_asked_for_or_known():
     task = task_of("CartPole-v1", max_steps=7, solved_reward=100)
     assert task.max_steps == task.params.max_steps_in_episode == 7
     assert task.solved_reward == 100.0
-    proxy = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
+    proxy = registry.make("proxy", paper_se(hidden_size=2), task)
     assert proxy.default_params.max_steps_in_episode == 7
     for limit in (0, 2**31):
         with pytest.raises(ConfigError, match=r"^env\.max_steps must be"):

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from fake_hub import oid, serving
 from safetensors.numpy import save
+from support import paper_se
 
 import sejax
 from sejax.options import ConfigError
@@ -148,7 +149,7 @@ def front_and_card(server, repo):
 def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, solved_reward=1.0,
                       max_steps=10)  # fmt: skip
-    env = sejax.SyntheticConfig(hidden_size=2).make(task)
+    env = paper_se(hidden_size=2).make(task)
     path = tmp_path / "mine.safetensors"
     sejax.save(path, env, env.init_weights(jax.random.key(0)))
     address = sejax.push(path, "me/mine")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import paper_se
 
 import sejax
 from sejax import envs
@@ -18,7 +19,6 @@ from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
 from sejax.objectives import MaxReward, Outcome, Scoring
 from sejax.options import ConfigError, registry
-from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
 NAN, INF = np.nan, np.inf
@@ -215,7 +215,7 @@ def test_an_incumbents_score_aggregates_the_means_of_its_agents(aggregate, weigh
 
 # --- Algorithm 1 ---------------------------------------------------------------------------------
 
-PROXY = registry.make("proxy", SyntheticConfig(hidden_size=4, done="threshold"), TASK)
+PROXY = registry.make("proxy", paper_se(hidden_size=4, done="threshold"), TASK)
 TRAINING = TrainingConfig(max_episodes=5, max_steps=30, stop_rule="never", test_episodes=2)
 ES = NESConfig(population_size=3, noise_std=1.0, num_evals=2, num_incumbent_evals=3)
 
@@ -367,7 +367,7 @@ def test_two_agents_are_one_program_with_a_training_loop_for_each():
         sejax.make_agent(dataclasses.replace(config, buffer_size=size), task) for size in sizes
     )
     bilevel = make_bilevel(
-        task=task, agent=Mixture(agents=agents), proxy=SyntheticConfig(hidden_size=4),
+        task=task, agent=Mixture(agents=agents), proxy=paper_se(hidden_size=4),
         es=NESConfig(population_size=23, num_incumbent_evals=23), devices=2, num_parallel=1,
         training=dataclasses.replace(TRAINING, max_steps=40),
     )  # fmt: skip

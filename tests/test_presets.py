@@ -7,7 +7,6 @@ import pytest
 
 import sejax
 from experiments.common.reward_networks import STUDIES
-from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.cli import preset_files
 from sejax.options import ConfigError, registry
@@ -83,7 +82,9 @@ def test_the_performance_preset_is_how_those_ses_were_made():
         assert (composed.proxy.hidden_size, composed.proxy.activation) == (128, "leaky_relu")
         assert composed.generations == 50
         assert (composed.agent.epsilon_init, composed.agent.epsilon_min) == (1.0, 0.01)
-        assert composed.agent == DDQNConfig() and composed.training.max_episodes == 1000
+        assert composed.training == sejax.TrainingConfig(
+            stop_rule="plateau", max_steps=None, max_episodes=1000
+        )
         assert composed.stop_when_solved
 
 
@@ -95,15 +96,16 @@ PAPERS = {
     "buffer_size": 100_000,
 }  # fmt: skip
 AGENTS = {
-    sejax.DDQNConfig: PAPERS,
-    sejax.DQNConfig: {"double": False, "epsilon_min": 0.05, "exploration_steps": 1000},
-    sejax.DiscreteTD3Config: {
+    "ddqn": PAPERS | {"exploration_steps": None},
+    "dueling_ddqn": PAPERS | {"feature_dim": 128, "stream_hidden_size": 128},
+    "dqn": PAPERS | {"double": False, "epsilon_min": 0.05, "exploration_steps": 1000},
+    "td3_discrete": {
         "learning_rate": 5e-4, "tau": 0.01, "policy_delay": 2, "batch_size": 128,
         "activation": "tanh", "hidden_size": 128, "num_layers": 2, "layer_norm": True,
         "temperature": 1.0, "one_hot_actions": False, "action_noise_std": 0.1,
         "target_noise_std": 0.2, "target_noise_clip": 0.5,
     },
-    sejax.SACConfig: {
+    "sac": {
         "learning_rate": 3e-4, "discount": 0.99, "num_layers": 2, "hidden_size": 256,
         "batch_size": 256, "activation": "relu", "target_entropy": -1.0,
         "tau": 0.005,
@@ -111,10 +113,21 @@ AGENTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("config", AGENTS, ids=lambda config: config.__name__)
-def test_agents_have_the_defaults_of_their_papers(config):
-    wanted = AGENTS[config]
-    assert {name: getattr(config(), name) for name in wanted} == wanted
+@pytest.mark.parametrize("agent", AGENTS)
+def test_agents_of_the_performance_preset_are_those_of_their_papers(agent):
+    config = composed_with("env=cartpole", "preset=paper_performance", f"agent={agent}").agent
+    wanted = AGENTS[agent]
+    assert {name: getattr(config, name) for name in wanted} == wanted
+
+
+@pytest.mark.parametrize("agent", [*AGENTS, "ppo", "td3"])
+def test_classes_have_the_defaults_of_the_command(agent):
+    env = "gymnax/MountainCarContinuous-v0" if agent == "td3" else "gymnax/MountainCar-v0"
+    composed = composed_with(f"env={env}", f"agent={agent}")
+    assert composed.agent == type(composed.agent)()
+    assert composed.proxy == sejax.SyntheticConfig()
+    assert composed.training == sejax.TrainingConfig()
+    assert composed.es == sejax.NESConfig()
 
 
 # Appendix "Reward Network Hyperparameters": the tables for learning RNs, a column for each task.
@@ -210,7 +223,7 @@ def test_what_is_tuned_is_known():
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
-    for path in preset_files.PRESETS.glob("*.yaml"):
+    for path in preset_files.PRESETS.glob("*-*.yaml"):
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in registry.names("proxy")
         assert env in (preset_files.GENERAL, *registry.names("env"))
@@ -233,12 +246,12 @@ def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing(
 @pytest.mark.parametrize("proxy", ["se", "rn"])
 def test_a_task_without_a_file_has_general_settings(proxy):
     composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
-    general = preset_files.sections_of("general", proxy)["best"]
     if proxy == "se":  # whose settings are the defaults in Python
-        assert composed.es == sejax.NESConfig() and composed.generations == 100
+        assert composed.generations == 100
     else:
         assert composed.proxy == sejax.RewardConfig() and composed.generations == 50
-    for name, value in general["training"].items():
-        assert getattr(composed.training, name) == value
+        assert composed.training == sejax.TrainingConfig(
+            stop_rule="solved", max_steps=None, max_episodes=100, test_episodes=1
+        )
     with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best"):
         sejax.config(["env=gymnax/MountainCar-v0", f"proxy={proxy}", "preset=paper"])

@@ -4,13 +4,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import pytest
-from support import large_ops_in_loops
+from support import large_ops_in_loops, paper_se, paper_training
 
 from sejax import envs
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.options import registry
-from sejax.proxies.configs import RewardConfig, SyntheticConfig
-from sejax.training import TrainingConfig, make_trainer
+from sejax.proxies.configs import RewardConfig
+from sejax.training import make_trainer
 
 CAPACITY = 7919  # rows of the replay buffer
 MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program is nearly as long
@@ -19,12 +19,12 @@ MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program i
 @pytest.fixture(scope="module")
 def case():
     """The traced-at-most-once training of a tiny agent in a tiny SE, and how to call it."""
-    env = registry.make("proxy", SyntheticConfig(hidden_size=4), envs.make("cartpole"))
+    env = registry.make("proxy", paper_se(hidden_size=4), envs.make("cartpole"))
     config = DDQNConfig(
         hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1, buffer_size=CAPACITY
     )
     agent = make_ddqn(config, 4, 2)
-    train = make_trainer(agent, env, TrainingConfig(max_episodes=MAX_EPISODES, window=2))
+    train = make_trainer(agent, env, paper_training(max_episodes=MAX_EPISODES, window=2))
     params = env.params(env.init_weights(jax.random.key(0))).replace(
         max_steps_in_episode=jnp.int32(5)
     )
@@ -106,7 +106,7 @@ def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     task = envs.make("cartpole")
     env = RewardConfig().make(task)
     agent = make_ddqn(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions)
-    training = TrainingConfig(max_episodes=100, stop_rule="never")
+    training = paper_training(max_episodes=100, stop_rule="never")
     key = jax.random.key(0)
     program = str(jax.make_jaxpr(make_trainer(agent, env, training))(key, env.default_params))
     assert "f32[20000," in program and "f32[1000000," not in program

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from support import paper_se
 
 import sejax
 from sejax import envs
@@ -20,7 +21,7 @@ from sejax.cli.config import learn_config
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import header
-from sejax.proxies.configs import RewardConfig, SyntheticConfig
+from sejax.proxies.configs import RewardConfig
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
 
@@ -445,7 +446,7 @@ def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
 
 
 def an_se_of(task, **config):
-    env = SyntheticConfig(**{"hidden_size": 3, "initial_state": "learned"} | config).make(task)
+    env = paper_se(**{"hidden_size": 3, "initial_state": "learned"} | config).make(task)
     return env, env.init_weights(jax.random.key(0))
 
 

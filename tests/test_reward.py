@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.environments.classic_control import cartpole
-from support import numpy_forward
+from support import numpy_forward, paper_training
 
 import sejax
 from sejax import bilevel, envs
@@ -308,7 +308,7 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
 def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
     env = make_env("cliff_walking")
     agent = make_agent(QLearningConfig(), env.task)
-    training = TrainingConfig(max_episodes=3, stop_rule="never", tests_between=1)
+    training = paper_training(max_episodes=3, stop_rule="never", tests_between=1)
 
     def test_fn(key, agent_state, active):
         return jnp.float32(2.0) + agent_state.epsilon, jnp.int32(7)

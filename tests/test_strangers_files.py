@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
+from support import paper_se
 
 import sejax
 from experiments import supervised_baseline
@@ -175,7 +176,7 @@ PROXIES = [x for x in FOREIGN if next(iter(x)) in ("env", "proxy", "agent")]
 def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
-    env = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
+    env = registry.make("proxy", paper_se(hidden_size=2), task)
     usual = {**configuration.plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
     weights = env.init_weights(jax.random.key(0))
     sejax.save("evil.safetensors", env, weights, config=usual | config)

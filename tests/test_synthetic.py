@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward
+from support import numpy_forward, paper_se
 
 from sejax import envs
 from sejax.options import ConfigError, registry
@@ -14,7 +14,7 @@ from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import SyntheticConfig
 
-CONFIG = SyntheticConfig(hidden_size=5, num_layers=2, activation="leaky_relu")
+CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])
 
 
@@ -380,7 +380,7 @@ def test_a_bandit_has_a_reward_and_nothing_else(done):
 ])  # fmt: skip
 def test_what_no_episode_can_be_is_refused(fields, at_fault):
     with pytest.raises(ConfigError) as error:
-        SyntheticConfig(**fields)
+        paper_se(**fields)
     assert error.value.field == f"proxy.{at_fault}"
 
 

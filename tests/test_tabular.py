@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_shares, drawing
+from support import assert_shares, drawing, paper_training
 
 from sejax import envs
 from sejax.agents.buffers import Transition
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, entry_of, make_tabular, mask_of
 from sejax.evaluation import make_tester
-from sejax.training import TrainingConfig, make_trainer
+from sejax.training import make_trainer
 
 NUM_STATES, NUM_ACTIONS = 5, 3
 KEY = jax.random.key(0)
@@ -250,7 +250,7 @@ ROOM = plain_world(("S ", " G"), -0.01, 1.0, -1.0)
 
 def trained(agent, task, num_episodes, num_agents):
     """`num_agents` trainings in the task, in lanes, and their test returns `[num_agents]`."""
-    config = TrainingConfig(
+    config = paper_training(
         max_episodes=num_episodes, stop_rule="never", time_limit_is_terminal=False
     )
     train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from support import paper_se
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.ops.networks import MLP
-from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
@@ -58,7 +58,7 @@ def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
     heads["done"]["Dense_1"]["bias"] -= 10  # never
-    env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
+    env = reference.SyntheticEnv(heads, paper_se(hidden_size=5))
     training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
     agent = dataclasses.replace(CONFIG, warmup_episodes=1)
     result = reference.train(env, agent, training, seed=0)

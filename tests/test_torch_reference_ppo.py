@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from support import paper_se, paper_training
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.policies import softmax
 from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.ops.networks import MLP
-from sejax.proxies.configs import SyntheticConfig
-from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -78,10 +77,10 @@ def test_it_learns_when_the_rollout_is_full():
     assert length == CONFIG.rollout_length(reference.MAX_STEPS)
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
-    env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
+    env = reference.SyntheticEnv(heads, paper_se(hidden_size=5))
 
     def actor_after(num_steps):
-        training = TrainingConfig(stop_rule="never", max_steps=num_steps)
+        training = paper_training(stop_rule="never", max_steps=num_steps)
         result = torch_ppo.train(env, CONFIG, training, seed=0)
         assert result.train_steps == num_steps
         return result.agent.state.networks.values

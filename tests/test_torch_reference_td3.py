@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from support import paper_se
 
 from sejax import envs
 from sejax.agents.buffers import Transition
@@ -20,7 +21,6 @@ from sejax.agents.td3 import (
     tanh_policy,
 )
 from sejax.ops.networks import MLP
-from sejax.proxies.configs import SyntheticConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -97,7 +97,7 @@ def test_the_critics_stacked_are_the_critics():
 
 
 def test_the_se_takes_continuous_actions_as_sejaxs_does():
-    env = SyntheticConfig(hidden_size=6).make(envs.make("pendulum"))
+    env = paper_se(hidden_size=6).make(envs.make("pendulum"))
     weights = env.init_weights(jax.random.key(0))
     obs, action = np.float32([0.6, -0.8, 0.3]), np.float32([1.5])
     step = reference.SyntheticEnv(weights, env.config).step(*map(torch.tensor, (obs, action)))

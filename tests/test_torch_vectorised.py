@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from support import paper_se
 
 from sejax.agents.dqn import DDQNConfig
-from sejax.proxies.configs import SyntheticConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -47,7 +47,7 @@ def test_a_step_of_many_is_that_of_each(done):
     weights = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
                for name, size in reference.HEADS.items()}  # fmt: skip
     weights["done"]["Dense_1"]["bias"] += 0.5  # some end, some do not
-    config = SyntheticConfig(hidden_size=5, num_layers=1, activation="leaky_relu", done=done)
+    config = paper_se(hidden_size=5, num_layers=1, activation="leaky_relu", done=done)
     env = reference.SyntheticEnv(weights, config)
     obs, action = torch.randn(20, 4), torch.randint(2, (20,))
     obs[3], obs[4, 0] = 1e9, float("nan")  # absurd

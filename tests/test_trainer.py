@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
-from support import numpy_forward
+from support import numpy_forward, paper_se, paper_training
 
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
@@ -21,8 +21,7 @@ from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
 from sejax.evaluation import make_recorder, make_tester
 from sejax.options import ConfigError, registry
-from sejax.proxies.configs import SyntheticConfig
-from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
+from sejax.training import is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)
@@ -30,7 +29,7 @@ ENV = ScriptedEnv()
 
 
 def training(**fields):
-    return TrainingConfig(
+    return paper_training(
         **{
             "max_episodes": MAX_EPISODES,
             "window": WINDOW,
@@ -192,7 +191,7 @@ def test_tests_need_a_test_function():
 
 def test_a_world_of_one_step_has_an_episode_for_each_step():
     task = envs.make("gridworld_2x2")
-    env = registry.make("proxy", SyntheticConfig(hidden_size=4, horizon=1), task)
+    env = registry.make("proxy", paper_se(hidden_size=4, horizon=1), task)
     config = QLearningConfig(learning_rate=1.0, epsilon_init=1.0, epsilon_min=1.0)
     params = env.params(env.init_weights(KEY))
     never = training(max_episodes=40, max_steps=40, stop_rule="never")
@@ -497,7 +496,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
 def ddqn_in_se():
     """Single and vmapped short trainings of a DDQN agent in SEs of different step limits."""
     task = envs.make("cartpole")
-    env = registry.make("proxy", SyntheticConfig(hidden_size=4), task)
+    env = registry.make("proxy", paper_se(hidden_size=4), task)
     config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
     train = make_trainer(
         make_ddqn(config, 4, 2), env, training(max_episodes=8, plateau_tolerance=0.3)
@@ -524,7 +523,7 @@ def test_lanes_equal_single_trainings(ddqn_in_se):
 def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
     """As programs; what they then do is above."""
     task = envs.make("cartpole")
-    synthetic = registry.make("proxy", SyntheticConfig(hidden_size=4), task)
+    synthetic = registry.make("proxy", paper_se(hidden_size=4), task)
     env, params = {
         "real": (task.env, task.params),
         "synthetic": (synthetic, synthetic.default_params),
@@ -680,8 +679,8 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     """One-step SEs: the default's 1,000 episodes are 1,000 steps."""
     task = envs.make("cartpole")
     agent = registry.make("agent", DDQNConfig(warmup_episodes=1), task)
-    env = SyntheticConfig(initial_state="learned", horizon=1).make(task)
-    asked = TrainingConfig(max_steps=4000, stop_rule="never")
+    env = paper_se(initial_state="learned", horizon=1).make(task)
+    asked = paper_training(max_steps=4000, stop_rule="never")
     with pytest.raises(ConfigError, match=r"Set training\.max_episodes=4000\.$") as error:
         make_trainer(agent, env, asked)
     assert error.value.field == "training.max_episodes"
@@ -702,7 +701,7 @@ def test_arguments_of_other_kinds_are_refused(swapped, field):
         make_trainer(*swapped(agent, task))
     assert error.value.field == field
     with pytest.raises(ConfigError) as error:
-        evaluation.make_evaluator(agent, task.env, task.env, TrainingConfig())
+        evaluation.make_evaluator(agent, task.env, task.env, paper_training())
     assert error.value.field == "task"
     with jax.enable_x64(True), pytest.raises(ConfigError) as error:
         make_trainer(agent, task.env)

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from support import paper_se, paper_training
 
+import sejax
 from sejax import envs
 from sejax.agents import make_agent
 from sejax.agents.base import Agent, AgentConfig, Draw, Varied, drawing_key
@@ -21,8 +23,6 @@ from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.ops.networks import MLP, narrow
 from sejax.options import ConfigError
-from sejax.proxies.configs import SyntheticConfig
-from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
@@ -33,12 +33,13 @@ NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than o
 
 
 def test_ranges_around_the_default_agent_are_the_papers():
-    ranges = ranges_of(DDQNConfig())
+    paper = sejax.config(["env=cartpole", "preset=paper_performance"]).agent
+    ranges = ranges_of(paper)
     assert ranges["learning_rate"] == pytest.approx((1e-3 / 3, 3e-3, True, False))
     assert ranges["batch_size"] == (42, 384, True, True)
     assert ranges["hidden_size"] == (42, 384, True, True)
     assert ranges["num_layers"] == (1, 3, False, True)
-    assert ranges_of(DDQNConfig(num_layers=1))["num_layers"] == (1, 2, False, True)
+    assert ranges_of(DDQNConfig())["num_layers"] == (1, 2, False, True)
     tabular = ranges_of(QLearningConfig())
     assert tabular == dict.fromkeys(("learning_rate", "discount"), (0.1, 1.0, False, False))
 
@@ -342,8 +343,8 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
 @pytest.mark.slow
 def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     task = envs.make("cartpole")
-    env = SyntheticConfig(hidden_size=4).make(task)
-    training = TrainingConfig(stop_rule="never", max_steps=60, test_episodes=2)
+    env = paper_se(hidden_size=4).make(task)
+    training = paper_training(stop_rule="never", max_steps=60, test_episodes=2)
     # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
     config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, warmup_episodes=0)
     varied = make_agent(config, task, varied=True)

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
+from support import paper_training
 
 from sejax import envs
 from sejax.envs.wrappers import repeat_actions
-from sejax.training import TrainingConfig, make_trainer
+from sejax.training import make_trainer
 
 KEY = jax.random.key(0)
 
@@ -51,7 +52,7 @@ def test_one_repeat_is_the_world_itself():
 def test_a_trainer_counts_steps_of_the_world():
     agent = scripted_agent()
     agent = dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, action_repeat=3))
-    training = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never")
+    training = paper_training(max_episodes=MAX_EPISODES, stop_rule="never")
     train = jax.jit(make_trainer(agent, ScriptedEnv(), training))
     result = train(KEY, script([1.0] * MAX_EPISODES, [99] * MAX_EPISODES))
     assert result.train_steps == MAX_EPISODES * MAX_STEPS  # 3 + 1 steps in each episode

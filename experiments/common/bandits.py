@@ -90,7 +90,7 @@ class PolicyBandit(ProxyEnv):
     """
 
     def __init__(self, task: Task):
-        config = sejax.SyntheticConfig(horizon=1, initial_state="noise", done="threshold")
+        config = sejax.SyntheticConfig(initial_state="noise")
         super().__init__(task, config)
 
     def init_weights(self, key: Array) -> dict[str, Array]:

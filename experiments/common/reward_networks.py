@@ -85,6 +85,7 @@ _CARTPOLE: dict[str, Any] = {
     "hidden_size": 64,
     "num_layers": 1,
     "buffer_size": 1_000_000,
+    "exploration_steps": None,
 }
 _FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
 STUDIES = {
@@ -100,7 +101,9 @@ STUDIES = {
     ),
     "cartpole": Study(
         agent=sejax.DDQNConfig(**_CARTPOLE),
-        transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
+        transfer_agent=sejax.DuelingDDQNConfig(
+            **_CARTPOLE, feature_dim=128, stream_hidden_size=128
+        ),
         tuned_agent=functools.partial(agents.tuned_agent, "cartpole", "ddqn"),
         rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig()},

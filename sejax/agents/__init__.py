@@ -79,7 +79,7 @@ def make_agent(
       >>> import sejax
       >>> agent = make_agent(sejax.DDQNConfig(hidden_size=64), sejax.envs.make("cartpole"))
       >>> agent.spec.warmup_episodes
-      10
+      1
     """
     require(
         isinstance(task, TaskSpec),

@@ -212,7 +212,7 @@ class AgentOptions(AgentConfig):
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
     # Episodes before learning starts and before a stop rule may judge.
-    warmup_episodes: int = option(10, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         return self.warmup_episodes * max_episode_steps

@@ -31,14 +31,14 @@ LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 @dataclass(frozen=True, kw_only=True)
 class DDQNConfig(OffPolicyOptions, TorsoOptions):
-    """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
+    """DDQN's hyperparameters."""
 
     epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
     # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
     # the episodes: for environments whose episodes have one or two steps.
-    exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
+    exploration_steps: int | None = option(1000, counts("it counts steps"), traced=True)
     double: bool = True  # the online network chooses a target's action; else the target network
     loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
     target_update_every: int = option(1, counts())  # learning steps for each update of the target
@@ -75,10 +75,10 @@ class DuelingDDQNConfig(DDQNConfig):
 
     cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
-    feature_dim: int = option(128, counts())  # outputs of the part that both streams share
+    feature_dim: int = option(64, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.
     stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
-    stream_hidden_size: int = option(128, counts())
+    stream_hidden_size: int = option(32, counts())
 
     def network(self, num_actions: int) -> nn.Module:
         return DuelingMLP(
@@ -94,11 +94,10 @@ class DuelingDDQNConfig(DDQNConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class DQNConfig(DDQNConfig):
-    """DQN: without double Q-learning, and with an epsilon that falls by steps."""
+    """DQN: without double Q-learning."""
 
     double: bool = False
     epsilon_min: float = 0.05
-    exploration_steps: int | None = 1000
 
 
 @struct.dataclass

@@ -33,12 +33,16 @@ from sejax.options import (
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyOptions(AgentOptions):
-    """Hyperparameters of an agent that learns at each step from a batch of earlier ones."""
+    """Hyperparameters of an agent that learns at each step from a batch of earlier ones.
 
-    batch_size: int = option(128, counts(), varied="triple")  # transitions
+    The defaults are small agents, quick to learn within 2,000 steps (`docs/agents.md`);
+    `preset=paper` has the paper's.
+    """
+
+    batch_size: int = option(64, counts(), varied="triple")  # transitions
     buffer_size: int = option(100_000, counts())  # steps
-    hidden_size: int = option(128, counts(), varied="triple")  # units of each hidden layer
-    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
+    hidden_size: int = option(64, counts(), varied="triple")  # units of each hidden layer
+    num_layers: int = option(1, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
     learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")  # of Adam
     # Weight of the online network in the target's update.
@@ -71,9 +75,7 @@ class ActorCriticOptions(OffPolicyOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    batch_size: int = 256
-    learning_rate: float = 3e-4  # of the actor, the critics and the temperature
-    tau: float = 0.005
+    learning_rate: float = 3e-3  # of the actor, the critics and the temperature
     action_repeat: int = option(1, counts())  # environment steps for each decision
 
     def spec(self) -> AgentSpec:

@@ -57,7 +57,6 @@ class PPOConfig(TorsoOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    warmup_episodes: int = 1  # PPO learns from the start; this only holds back the stop rule
     hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("tanh", one_of(ACTIVATIONS))
@@ -136,6 +135,7 @@ class PPOConfig(TorsoOptions):
         return self.rollout_length(task_max_steps) * self.action_repeat
 
     def spec(self) -> AgentSpec:
+        # It learns from the start; `warmup_episodes` only holds back the stop rule.
         return dataclasses.replace(super().spec(), learns_from=0, action_repeat=self.action_repeat)
 
     def optimizer(self) -> optax.GradientTransformation:

@@ -33,15 +33,15 @@ _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' c
 
 @dataclass(frozen=True, kw_only=True)
 class SACConfig(ActorCriticOptions):
-    """SAC's hyperparameters; the defaults are those of Haarnoja et al. (2018), table 1.
+    """SAC's hyperparameters.
 
-    Differs: the buffer holds 100,000 steps where the authors' holds a million. Christodoulou (2019)
+    Differs: Haarnoja et al. (2018) have two layers of 256 units, batches of 256 out of a million
+    steps, a learning rate of 0.0003 and a tau of 0.005 (table 1). Christodoulou (2019)
     has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    hidden_size: int = 256
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
     # to meet a target entropy.
     alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)

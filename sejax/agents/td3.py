@@ -33,15 +33,11 @@ _MIN_TEMPERATURE = 1e-6
 class TD3Config(ActorCriticOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
-    The defaults are the paper's for HalfCheetah; for MountainCarContinuous it has
-    `warmup_episodes=50 action_repeat=2`.
-
     Differs: the authors do not scale the target policy's noise by the largest action. That is the
     same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
     unless `noisy_tests` is set.
     """
 
-    warmup_episodes: int = 20
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
     # Exploration, in units of the largest action.
     action_noise_std: float = option(0.1, not_negative(), traced=True)
@@ -68,11 +64,8 @@ class DiscreteTD3Config(TD3Config):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    warmup_episodes: int = 10
-    batch_size: int = 128
     activation: str = "tanh"
-    learning_rate: float = 5e-4
-    tau: float = 0.01
+    learning_rate: float = 1e-3
     layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
     # Of the Gumbel-Softmax at the start.
     temperature: float = option(1.0, positive(MOVES), traced=True)

@@ -87,7 +87,7 @@ def compose(schema: "type[CommandConfig]", overrides: Sequence[str]) -> Composed
       ConfigError: for an override that cannot be.
     """
     given = read(overrides)
-    mixture = _mixture(given)
+    mixture = mixture_of(given)
     chosen = _choices(schema, given, mixture)
     fields = _fields(schema, chosen, mixture)
     settings = {k: x for k, x in given.items() if k not in (*schema.groups, "agents")}
@@ -208,7 +208,7 @@ def named(field: str) -> Iterator[None]:
         raise ConfigError(re.sub(r"\bagent=", "agents=", text), at_fault) from error
 
 
-def _mixture(given: Mapping[str, Any]) -> dict[str, str]:
+def mixture_of(given: Mapping[str, Any]) -> dict[str, str]:
     """The names of a mixture's agents by their keys; empty without `agents=[...]`.
 
     A key is the agent's name, or any word with `agents.KEY.name`.

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 from sejax import agents, envs
 from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
-from sejax.cli.compose import DEFAULTS, compose, key_of, named
+from sejax.cli.compose import DEFAULTS, compose, key_of, mixture_of, named, read
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -37,7 +37,7 @@ AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
-REAL_TRAINING = TrainingConfig(stop_rule="solved")
+REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 JOINT = "+"  # between the agents of a mixture, in names
 Schema = TypeVar("Schema", bound="CommandConfig")
 
@@ -273,8 +273,8 @@ class EvaluateConfig(CommandConfig):
     proxy: str  # a run directory, a safetensors file, a shipped name (cartpole), or real
     env: str | None = None  # the task, where proxy=real or the proxy's is your own
     proxy_kind: str | None = None  # my_module:MyProxy, where the proxy is of a kind of your own
-    # default: the agent's; varied: drawn around them for each agent; as_learned: agent and
-    # exploration that the proxy was learned with.
+    # as_learned: agents and exploration that the proxy was learned with, where no agent is named;
+    # default: the agent's; varied: drawn around them for each agent.
     agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
     # How long agents train on the proxy. proxy: on an SE as it was learned with, on a reward
     # network as on the real task (as_learned: with the time limit as in its run); config: as
@@ -437,23 +437,71 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the overrides after `python -m sejax.evaluate`."""
     _require_overrides(overrides)
     with registry.only_typed(overrides):
-        composed = compose(EvaluateConfig, overrides)
+        composed = compose(EvaluateConfig, with_learned(overrides))
         require(
             "proxy" in composed.values,
             "proxy",
             "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
             "proxy=real env=cartpole.",
         )
-        groups = ("agents", *EvaluateConfig.groups)
-        own = [(k, x) for k, x in composed.given.items() if k.partition(".")[0] in groups]
-        as_learned = composed.values.get("agent_hparams") == "as_learned"
-        require(
-            not own or not as_learned or composed.values["proxy"] == "real",
-            own[0][0].partition(".")[0] if own else "",
-            "must be left out with agent_hparams=as_learned; got "
-            f"{shortened(', '.join(f'{k}={x}' for k, x in own))}. Set agent_hparams=default.",
-        )
         return _from_plain(EvaluateConfig, composed.values)
+
+
+def with_learned(overrides: Sequence[str]) -> list[str]:
+    """Overrides that say which agents a stored proxy was learned with, then those of an evaluation.
+
+    Where these name no agent, they are all of the proxy's, with their exploration. An agent that
+    they name has the hyperparameters that the proxy was learned with, if it was with such a one.
+
+    Raises:
+      ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
+        tell its agents.
+    """
+    from sejax.proxies import header  # which reads files, and hubs
+
+    given = read(overrides)
+    source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
+    if source == "real" or hparams not in (None, "as_learned"):
+        return [*overrides]
+    groups = ("agents", *EvaluateConfig.groups)
+    own = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
+    require(
+        not own or hparams is None,
+        next(iter(own), "").partition(".")[0],
+        "must be left out with agent_hparams=as_learned; got "
+        f"{shortened(', '.join(f'{k}={x}' for k, x in own.items()))}. Set agent_hparams=default.",
+    )
+    try:
+        path = header.find(source, "proxy")
+        stored = header.read_config(path, "proxy")
+        learned = {
+            key: registry.describe("agent", header.configured("agent", values, path.name))
+            for key, values in header.agents_of(stored).items()
+        }
+        explored = header.configured(
+            "exploration", stored.get("exploration", {"name": "none"}), path.name
+        )
+    except ConfigError:  # of the proxy, which is said when it is loaded
+        if hparams == "as_learned":
+            raise
+        return [*overrides]
+    if own:
+        by_name = {values["name"]: values for values in learned.values()}
+        named = {f"agents.{key}": name for key, name in mixture_of(given).items()}
+        if not named:
+            default = agents.default_for(EvaluateConfig.spec_for(given))
+            named = {"agent": given.get("agent", default)}
+        fields = flatten({field: by_name.get(name, {}) for field, name in named.items()})
+        fields.pop("agent.name", None)
+    else:
+        parts = {"exploration": registry.describe("exploration", explored)}
+        parts |= {"agent": next(iter(learned.values()))} if len(learned) == 1 else {}
+        fields = {group: values.pop("name") for group, values in parts.items()}
+        fields |= flatten(parts) | {"agent_hparams": "as_learned"}
+        if len(learned) > 1:
+            fields |= {"agents": list(learned)} | flatten({"agents": learned})
+    words = [f"{name}={as_text(x)}" for name, x in fields.items() if name not in given]
+    return [*words, *overrides]
 
 
 def _require_overrides(overrides: object) -> None:

@@ -2,8 +2,9 @@
 
 sejax's own are `presets/<env>-<proxy>.yaml`, with a section for each preset: values, `with_agent`,
 `with_es` and `with_objective` for those that only hold with one of these, and `like` for a section
-that it builds on. `general-<proxy>.yaml` serves tasks without a file of their own, and sections
-that say `like: general`. A user's file (`preset=FILE.yaml`) holds overrides.
+that it builds on, of its file or of `bases.yaml`. `general-<proxy>.yaml` serves tasks without a
+file of their own, and sections that say `like: general`. A user's file (`preset=FILE.yaml`) holds
+overrides.
 """
 
 import functools
@@ -24,16 +25,23 @@ ENDING = ".yaml"  # of a preset file
 @functools.cache
 def _all_sections() -> dict[str, dict[str, dict[str, Any]]]:
     """The sections of all files by the files' stems, each with what it builds on merged in."""
-    paths = sorted(PRESETS.glob(f"*{ENDING}"), key=lambda path: not path.stem.startswith(GENERAL))
+    paths = sorted(PRESETS.glob(f"*-*{ENDING}"), key=lambda path: not path.stem.startswith(GENERAL))
+    bases = _read_sections(PRESETS / f"bases{ENDING}", {})
     files: dict[str, dict[str, dict[str, Any]]] = {}
     for path in paths:  # the general ones first
-        sections = files[path.stem] = yaml.safe_load(path.read_text(encoding="utf-8"))
-        for name, section in sections.items():
-            like = section.pop("like", None)  # stands before it in the file
-            general = f"{GENERAL}-{path.stem.rpartition('-')[2]}"
-            base = files[general][name] if like == GENERAL else sections[like] if like else {}
-            sections[name] = merge(base, section)
+        general = files.get(f"{GENERAL}-{path.stem.rpartition('-')[2]}", {})
+        files[path.stem] = _read_sections(path, bases | {GENERAL: general.get("best", {})})
     return files
+
+
+def _read_sections(path: Path, bases: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sections of a file; what they build on stands before them in it, or is one of `bases`."""
+    sections: dict[str, dict[str, Any]] = {}
+    for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
+        like = section.pop("like", None)
+        base = {**bases, **sections}[like] if like else {}
+        sections[name] = merge(base, section)
+    return sections
 
 
 def names() -> list[str]:

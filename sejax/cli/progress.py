@@ -155,9 +155,7 @@ class RunProgress(Reporter):
             )
         path, config = directory.path, self._config
         agents = [registry.name_of("agent", each.agent) for each in members_of(config)]
-        words = next_steps.evaluate_words(
-            path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
-        )
+        words = next_steps.evaluate_words(path, config.name("env"), config.name("proxy"), agents)
         self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"

@@ -49,6 +49,7 @@ TAKEN = {
 }
 # Fields that may differ between the workers of a study, and between its sessions.
 OWN = {"trials", "timeout", "storage", "search_dir", "sampler_seed", "verify", "fresh_seeds"}
+DEFAULT = "agent_hparams=default"  # an agent's fields are searched around its class's
 NAMES = {"study", "space"}  # which stand for what is compared
 
 
@@ -154,7 +155,8 @@ class Search:
         given = self.choice("agent", "")
         choices = [x for x in self.fixed if "." not in x.partition("=")[0]]
         if self.is_of_agent and not given:
-            return registry.name_of("agent", configuration.evaluate_config(choices).agent)
+            config = configuration.evaluate_config([*choices, DEFAULT])
+            return registry.name_of("agent", config.agent)
         return given or configuration.config(choices).name("agent")
 
     @functools.cached_property

@@ -25,7 +25,7 @@ from sejax.cli import session
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
 from sejax.cli.run_directory import open_for
-from sejax.cli.search_config import Search
+from sejax.cli.search_config import DEFAULT, Search
 from sejax.cli.worlds import proxy_setup
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
@@ -192,13 +192,13 @@ class Tuning:
 
     def __init__(self, search: Search):
         self._search = search
-        self._default = configuration.evaluate_config(search.fixed)
+        self._default = configuration.evaluate_config([DEFAULT, *search.fixed])
         header.find(self._default.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
 
     def config(self, overrides: Sequence[str]) -> EvaluateConfig:
         """See `Runner`; also refused are agents that would not learn on the proxy."""
-        config = configuration.evaluate_config([*self._search.fixed, *overrides])
+        config = configuration.evaluate_config([DEFAULT, *self._search.fixed, *overrides])
         require(
             config.agents is None,
             "agent",

@@ -76,12 +76,6 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     proxy = load(config, load_proxy)
     env, task = proxy.env, proxy.task
     members, exploration = members_of(config), config.exploration
-    if config.agent_hparams == "as_learned":
-        learned = proxy.learned_agents().items()
-        members = tuple(
-            MixtureMember(key=key, field="agent", agent=agent) for key, agent in learned
-        )
-        exploration = proxy.learned_with("exploration")
     trainings = {}
     for member in members:
         agent = member.agent

@@ -7,8 +7,9 @@ sums are made in another order.
 VECTOR = 8  # float32 numbers that one instruction works on; a remainder costs more than padding
 
 # A learning step on a network of one hidden layer is small up to this product of hidden and batch
-# size: what surrounds its matrix products takes longer than they do. Such agents train 2.3 times as
-# fast in batches of SMALL_NUM_PARALLEL as alone. Twice as many gain another 3%, and a population is
+# size: what surrounds its matrix products takes longer than they do. Such agents train twice as
+# fast in batches of SMALL_NUM_PARALLEL as alone: default DDQN takes 0.050, 0.037, 0.030, 0.027 and
+# 0.025 CPU s for 2,000 steps on CartPole's SE in batches of 1, 2, 4, 8 and 16. A population is
 # filled up to whole batches.
 SMALL_PRODUCT = 64 * 64
 SMALL_NUM_PARALLEL = 8
@@ -20,6 +21,18 @@ NUM_BLOCKS, MIN_BLOCK = 4, 32
 # Sizes of networks that varied agents choose from, for one hidden layer and for more. What room to
 # spare costs grows with the size of one layer, and with the square of the size of more.
 NUM_SIZES, NUM_SIZES_DEEP = 6, 12
+
+
+def width_of(num_agents: int) -> int:
+    """The widest batch, a power of two, of which few agents fill two: one on each of two devices.
+
+    A batch is filled up with copies, which would cost eight agents the time of sixteen.
+
+    Example:
+      >>> [width_of(num_agents) for num_agents in (1, 4, 8, 20)]
+      [1, 2, 4, 8]
+    """
+    return 1 << max(0, (num_agents // 2).bit_length() - 1)
 
 
 def whole_vectors(size: int) -> int:

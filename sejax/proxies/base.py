@@ -9,6 +9,7 @@ import copy
 import functools
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import jax
@@ -41,6 +42,8 @@ class ProxyEnv(Environment, ABC):
     Attributes:
       task: the real task, whose spaces the proxy has.
       config: the configuration that it was made from.
+      bare: the same without default params: one object for all stored proxies of a configuration.
+      learned_config: what a stored proxy was learned with, nested plain values; None for others.
 
     Raises:
       ConfigError: for a configuration that does not derive from `ProxyConfig`.
@@ -56,6 +59,8 @@ class ProxyEnv(Environment, ABC):
         self.spaces = task.observation, task.action
         self.task = task
         self.config: Any = config  # of the class that made it, with its own fields
+        self.bare = self
+        self.learned_config: Mapping[str, Any] | None = None
         self._default_params: Any = None
 
     @abstractmethod
@@ -101,10 +106,17 @@ class ProxyEnv(Environment, ABC):
         """Random weights, or those given to `with_default_params`."""
         return self._default_params or self.params(self.init_weights(jax.random.key(0)))
 
-    def with_default_params(self, params: PyTree) -> "ProxyEnv":
-        """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
+    def with_default_params(
+        self, params: PyTree, learned_config: Mapping[str, Any] | None = None
+    ) -> "ProxyEnv":
+        """A copy for callers that rely on `default_params`, such as `gymnax.make`.
+
+        Args:
+          params: the default ones.
+          learned_config: configuration that a stored proxy was learned with, nested plain values.
+        """
         env = copy.copy(self)
-        env._default_params = params
+        env._default_params, env.learned_config = params, learned_config
         return env
 
     @property

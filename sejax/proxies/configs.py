@@ -63,8 +63,8 @@ class Units(NamedTuple):
 class SyntheticConfig(ProxyConfig):
     """The SE's networks, where its episodes begin, and how they end.
 
-    The paper's SE is `initial_state=real horizon=null done=soft`; the contextual bandit of Liesen
-    et al. (2024) is `initial_state=learned horizon=1`.
+    The default is the contextual bandit of Liesen et al. (2024): everything about it is seen by any
+    agent. The paper's SE is `initial_state=real horizon=null done=soft`.
     """
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
@@ -73,20 +73,20 @@ class SyntheticConfig(ProxyConfig):
     # How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 - d
     # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
     # with probability sigmoid(d). Agents see all ends but the first.
-    done: str = option("soft", one_of(DONE_MODES))
+    done: str = option("threshold", one_of(DONE_MODES))
     # First step of an episode that d may end it at; before it, targets bootstrap with 1. An SE of
     # episodes of a step or two is a bandit, whatever its networks could do.
     min_steps: int = option(1, counts("an episode has steps"))
     # real: the task's initial states; learned: standard normal noise plus a network's output for
     # it; noise: noise alone, in the units of `state_units`.
-    initial_state: str = option("real", one_of(INITIAL_STATES))
+    initial_state: str = option("learned", one_of(INITIAL_STATES))
     # Units in which the networks see and make states. raw: the task's own; bounds: 0 is the middle
     # of a bounded observation and 1 is half of the way to its bound. A car's velocity lies in
     # [-0.07, 0.07], where noise of 1 would be no measure.
     state_units: str = option("raw", one_of(STATE_UNITS))
     # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
     # next-state nor a done network.
-    horizon: int | None = option(None, counts("an episode has steps"))
+    horizon: int | None = option(1, counts("an episode has steps"))
     # What the reward network of a bandit makes. network: the reward of an action; distance,
     # quadratic: the best of continuous actions, in units of their bound, from which the reward is
     # minus the sum of the distances, or of their squares, so that the best policy is known.
@@ -167,8 +167,8 @@ class SyntheticConfig(ProxyConfig):
         """Number of inputs and of each layer's units, by network.
 
         Example:
-          >>> SyntheticConfig(horizon=1, hidden_size=8).networks(obs_dim=4, action_dim=2)
-          {'reward': [6, 8, 1]}
+          >>> SyntheticConfig(hidden_size=8).networks(obs_dim=4, action_dim=2)
+          {'reward': [6, 8, 1], 'start': [4, 32, 4]}
         """
         outputs = {"state": obs_dim, "reward": 1, "done": 1}
         heads = ("reward",) if self.is_bandit else tuple(outputs)

@@ -88,9 +88,6 @@ def make_exact(
         num_layers=len(reward) - 1,
         start_hidden_size=max(START_HIDDEN_SIZE, task.obs_dim),
         activation="relu",
-        done="threshold",
-        initial_state="learned",
-        horizon=1,
         **known,
     )
     weights = {

@@ -150,6 +150,22 @@ def is_registered(group: str, stored: object) -> bool:
     return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
 
 
+def configured(group: str, values: object, where: str) -> Any:
+    """The configuration of a group that a file holds as plain values.
+
+    Raises:
+      ConfigError: if they are none, or of a name that is not registered.
+    """
+    name = values.get("name") if isinstance(values, Mapping) else "none"
+    require(
+        is_registered(group, values),
+        group,
+        f"must be a registered one in {shortened(where, 60)}, because what a file names is "
+        f"never imported; got {shortened(name, 60)}. Set {group} to one of your own.",
+    )
+    return registry.configure(group, values)  # type: ignore[arg-type]
+
+
 # --- where a file is ------------------------------------------------------------------------------
 
 

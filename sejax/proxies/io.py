@@ -13,12 +13,24 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PyTree
 
 from sejax import envs
+from sejax.agents import Agent, make_agent
 from sejax.envs.base import Task
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, as_python, one_of, registry, require, shortened, told
+from sejax.options import (
+    ConfigError,
+    as_python,
+    one_of,
+    registry,
+    require,
+    shortened,
+    told,
+    unknown_name,
+)
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
 from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
+
+NONE = {"name": "none"}  # the exploration where a file tells none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +72,7 @@ class _Loaded:
           0.8
         """
         one_of(registry.GROUPS)("group", str(group), None)
-        return self._configured(group, self.config.get(group))
+        return header.configured(group, self.config.get(group), self.path.name)
 
     def learned_agents(self) -> dict[str, Any]:
         """The agent that it was learned with, or the mixture of agents, by their keys.
@@ -72,18 +84,10 @@ class _Loaded:
           >>> list(load_proxy("cliff_walking-rn").learned_agents())
           ['q_learning']
         """
-        stored = agents_of(self.config)
-        return {key: self._configured("agent", values) for key, values in stored.items()}
-
-    def _configured(self, group: str, stored: object) -> Any:
-        name = stored.get("name") if isinstance(stored, Mapping) else "none"
-        require(
-            header.is_registered(group, stored),
-            group,
-            f"must be a registered one in {shortened(self.path.name, 60)}, because what a file "
-            f"names is never imported; got {shortened(name, 60)}. Set {group} to one of your own.",
-        )
-        return registry.configure(group, stored)  # type: ignore[arg-type]
+        return {
+            key: header.configured("agent", values, self.path.name)
+            for key, values in agents_of(self.config).items()
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +157,7 @@ class ProxySet(_Loaded):
         weights = jax.tree.map(lambda x: jax.numpy.asarray(x[places]), self.weights)
         params = self.env.params(weights, self.discount)
         return Proxy(
-            env=self.env.with_default_params(params),
+            env=self.env.with_default_params(params, self.config),
             params=params,
             record=self.records[places],
             config=self.config,
@@ -177,18 +181,46 @@ class ProxySet(_Loaded):
         return self[(order if worst else order[::-1])[:count]]
 
 
-def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
-    """The configuration that a stored proxy was learned with, nested plain values.
+def stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[str, Any]]:
+    """The environment of a stored proxy, and the configuration that it was learned with.
 
     Raises:
       ConfigError: for an argument of another type.
     """
+    if isinstance(proxy, _Loaded):
+        return proxy.env, proxy.config
+    config = getattr(proxy, "learned_config", None)
     require(
-        isinstance(proxy, _Loaded),
+        config is not None,
         "proxy",
-        f"must be a stored one; got {type(proxy).__name__}. Set proxy=sejax.load_proxy(source).",
+        f"must be a stored one; got {type(proxy).__name__}. Set env, params = sejax.load(source).",
     )
-    return proxy.config
+    return proxy, config  # type: ignore[return-value]
+
+
+def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Agent:
+    """A fresh agent like those that a stored proxy was learned with, and its exploration.
+
+    Args:
+      proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
+      name: of one of several agents; None for the first, by the alphabet.
+
+    Raises:
+      ConfigError: for a proxy that is not stored, or was not learned with such an agent.
+
+    Example:
+      >>> env, params = load("cartpole")  # learned with ddqn, ppo and td3_discrete
+      >>> agent_of(env, "ppo").spec.learns_from
+      0
+    """
+    env, config = stored_env(proxy)
+    stored = agents_of(config)
+    name = next(iter(stored)) if name is None else name
+    if name not in stored:
+        raise unknown_name("name", name, list(stored))
+    agent = header.configured("agent", stored[name], env.name)
+    exploration = header.configured("exploration", config.get("exploration", NONE), env.name)
+    return make_agent(agent, env.task, exploration)
 
 
 # --- writing --------------------------------------------------------------------------------------
