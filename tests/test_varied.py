@@ -9,20 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from support import random_columns
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, AgentConfig, Draw, Varied, drawing_key
+from sejax.agents.base import Agent, Draw, Varied, drawing_key
 from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
-from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.ops.networks import MLP, narrow
-from sejax.options import ConfigError
-from sejax.proxies.configs import SyntheticConfig
-from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
@@ -108,13 +105,8 @@ def embed(small, large):
 
 def random_batch(num_columns, seed):
     rng = np.random.default_rng(seed)
-    return Transition(
-        obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
-        action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)),
-        reward=np.float32(rng.normal(size=num_columns)),
-        discount=np.float32(rng.uniform(0, 1, num_columns)),
-        next_obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
-    )
+    columns = random_columns(rng, OBS_DIM, num_columns)
+    return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)), **columns)
 
 
 @pytest.mark.parametrize("kind", ["ddqn", "dueling"])
@@ -268,16 +260,6 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
-@dataclasses.dataclass(frozen=True)
-class ForeignConfig(AgentConfig):
-    """Of an agent that knows nothing of sejax's options."""
-
-    learning_rate: float = 0.5
-
-    def make(self, task):
-        return agent_that("is foreign")
-
-
 class Numbers(NamedTuple):
     rate: float
 
@@ -288,14 +270,6 @@ def agent_that(name, **fields):
         init=lambda key, hparams: name, act=None, update=None, buffer=no_buffer(),
         hparams=Numbers(rate=1.0), **fields,
     )  # fmt: skip
-
-
-def test_an_agent_none_of_whose_options_is_varied_is_refused():
-    task = envs.make("gridworld_2x2")
-    assert isinstance(make_agent(ForeignConfig(), task), Agent)
-    with pytest.raises(ConfigError) as error:
-        make_agent(ForeignConfig(), task, varied=True)
-    assert error.value.field == "agent_hparams"
 
 
 # --- whole programs ------------------------------------------------------------------------------
@@ -337,32 +311,3 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
     # An agent that nothing is drawn for runs with its own.
     which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
     assert (which, scaled) == (0, 3.0)
-
-
-@pytest.mark.slow
-def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
-    task = envs.make("cartpole")
-    env = SyntheticConfig(hidden_size=4).make(task)
-    training = TrainingConfig(stop_rule="never", max_steps=60, test_episodes=2)
-    # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
-    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, warmup_episodes=0)
-    varied = make_agent(config, task, varied=True)
-    assert len(varied.varied.agents) == 2
-    keys = jax.random.split(jax.random.key(5), 3)
-    outcome = evaluate_agents(varied, env, env.default_params, task, training, keys, devices=1)
-
-    @functools.cache
-    def alone(variant):
-        def train(key, hparams):
-            agent = dataclasses.replace(varied.varied.agents[variant], hparams=hparams)
-            return make_evaluator(agent, env, task, training)(key, env.default_params)
-
-        return jax.jit(train)
-
-    draw = jax.jit(lambda key: varied.varied.draw(drawing_key(key)))
-    draws = [draw(key) for key in keys]
-    assert {int(drawn.variant) for drawn in draws} == {0, 1}
-    for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):
-        expected = alone(int(drawn.variant))(key, drawn.hparams)
-        np.testing.assert_array_equal(outcome.test_returns[i], expected.test_returns)
-        assert outcome.train_steps[i] == expected.train_steps == 60
