@@ -68,7 +68,6 @@ class ScriptedEnv(environment.Environment[ScriptState, ScriptParams]):
 class ScriptedAgentState:
     episode: jax.Array
     num_updates: jax.Array
-    first_update_episode: jax.Array
     batch: Transition  # of the last update
     min_discount: jax.Array  # over all batches
     weight: jax.Array  # what hparams says; a float, so that it may diverge
@@ -80,7 +79,7 @@ def script(returns, lengths, **fields):
     )
 
 
-def scripted_agent(warmup_episodes=2, buffer_size=1000, batch_size=64):
+def scripted_agent(warmup_episodes=2, batch_size=64):
     empty = Transition(
         obs=jnp.zeros((2, batch_size)),
         action=jnp.zeros(batch_size, jnp.int32),
@@ -91,15 +90,13 @@ def scripted_agent(warmup_episodes=2, buffer_size=1000, batch_size=64):
 
     def init(key, hparams):
         return ScriptedAgentState(
-            episode=jnp.int32(-1), num_updates=jnp.int32(0), first_update_episode=jnp.int32(-1),
-            batch=empty, min_discount=jnp.float32(jnp.inf), weight=jnp.float32(hparams),
+            episode=jnp.int32(-1), num_updates=jnp.int32(0), batch=empty,
+            min_discount=jnp.float32(jnp.inf), weight=jnp.float32(hparams),
         )  # fmt: skip
 
     def update(key, state, batch):
-        first = jnp.where(state.num_updates == 0, state.episode, state.first_update_episode)
         return state.replace(
             num_updates=state.num_updates + 1,
-            first_update_episode=first,
             batch=batch,
             min_discount=jnp.minimum(state.min_discount, batch.discount.min()),
         )
@@ -110,7 +107,7 @@ def scripted_agent(warmup_episodes=2, buffer_size=1000, batch_size=64):
         act=lambda key, state, obs, explore: WHO * state.episode + obs[0].astype(jnp.int32),
         update=update,
         hparams=0.0,
-        buffer=replay_buffer(batch_size, buffer_size),
+        buffer=replay_buffer(batch_size, 1000),
         spec=AgentSpec(warmup_episodes=warmup_episodes, learns_from=warmup_episodes),
         discount=lambda hparams: 1.0,
     )

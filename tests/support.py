@@ -48,6 +48,18 @@ def unraveled(vector, like):
     )
 
 
+def assert_close(a, b, **tolerance):
+    """The numbers of two pytrees are close."""
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+def assert_equal(a, b):
+    """The numbers of two pytrees are the same."""
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
     """The MLP on a single input `[in]`, by plain loops over units."""
     activate = {
@@ -64,6 +76,17 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
         if layer < num_layers:
             x = activate(x)
     return x
+
+
+def random_columns(rng, obs_dim, batch_size):
+    """A batch's arrays but for its actions; discounts are such as an SE's soft done output."""
+    arrays = {
+        "obs": rng.normal(size=(obs_dim, batch_size)),
+        "reward": rng.normal(size=batch_size),
+        "discount": rng.uniform(-0.2, 1.2, batch_size),
+        "next_obs": rng.normal(size=(obs_dim, batch_size)),
+    }
+    return {name: np.float32(x) for name, x in arrays.items()}
 
 
 def train_on(agent, batch, num_updates):

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import assert_close, assert_equal
 
 import sejax
-from sejax import agents, envs
+from sejax import agents, envs, make_agent, make_trainer
 from sejax.agents import AgentConfig, Rollout, Transition
 from sejax.options import ConfigError, registry, traced_options
 
@@ -96,16 +97,6 @@ def started(case):
 @functools.cache
 def update_of(case):
     return jax.jit(parts(case)[1].update)
-
-
-def assert_close(a, b, **tolerance):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, **tolerance)
-
-
-def assert_equal(a, b):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
 
 
 def moved(a, b):
@@ -285,11 +276,24 @@ def test_units_and_columns_out_of_use_take_no_part(case):
 
 # --- what is refused -----------------------------------------------------------------------------
 
-CARTPOLE, ROOM, CLIFF = (envs.make(n) for n in ("cartpole", "gridworld_2x2", "cliff_walking"))
+CARTPOLE, ACROBOT, ROOM, CLIFF = (
+    envs.make(name) for name in ("cartpole", "acrobot", "gridworld_2x2", "cliff_walking")
+)
+COUNTS, ICM = sejax.CountBasedConfig(), sejax.ICMConfig()
 
 
 @dataclasses.dataclass(frozen=True)
 class Unrelated:
+    def make(self, task):
+        return parts(PLAIN[0])[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed(AgentConfig):
+    """Of an agent that fits every task and knows nothing of sejax's options."""
+
+    learning_rate: float = 0.5
+
     def make(self, task):
         return parts(PLAIN[0])[1]
 
@@ -301,27 +305,20 @@ class Unrelated:
         (lambda: sejax.DDQNConfig(learning_rate=5e-324), "agent.learning_rate"),
         (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.batch_size"),
         (
-            lambda: sejax.make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE),
+            lambda: make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE),
             "agent.target_entropy",
         ),
-        (lambda: sejax.make_agent(Unrelated(), CARTPOLE), "agent"),
-        (lambda: sejax.make_agent(sejax.DDQNConfig, CARTPOLE), "agent"),
-        (lambda: sejax.make_agent(sejax.DDQNConfig(), CARTPOLE, Unrelated()), "exploration"),
-        (lambda: sejax.make_agent(sejax.QLearningConfig(), CARTPOLE), "agent"),
-        (
-            lambda: sejax.make_agent(sejax.DDQNConfig(), CARTPOLE, sejax.CountBasedConfig()),
-            "exploration",
-        ),
-        (
-            lambda: sejax.make_trainer(sejax.make_agent(sejax.QLearningConfig(), ROOM), CLIFF.env),
-            "agent",
-        ),
-        (
-            lambda: sejax.make_trainer(
-                sejax.make_agent(sejax.DDQNConfig(), envs.make("acrobot")), CARTPOLE.env
-            ),
-            "agent",
-        ),
+        (lambda: make_agent(Unrelated(), CARTPOLE), "agent"),
+        (lambda: make_agent(sejax.DDQNConfig, CARTPOLE), "agent"),
+        (lambda: make_agent(sejax.QLearningConfig(), CARTPOLE), "agent"),
+        (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, Unrelated()), "exploration"),
+        (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, COUNTS), "exploration"),
+        # Curiosity is for agents that learn once at each step.
+        (lambda: make_agent(sejax.DDQNConfig(train_every=4), CARTPOLE, ICM), "exploration"),
+        (lambda: make_agent(sejax.DDQNConfig(gradient_steps=4), CARTPOLE, ICM), "exploration"),
+        (lambda: make_agent(Fixed(), ROOM, varied=True), "agent_hparams"),
+        (lambda: make_trainer(make_agent(sejax.QLearningConfig(), ROOM), CLIFF.env), "agent"),
+        (lambda: make_trainer(make_agent(sejax.DDQNConfig(), ACROBOT), CARTPOLE.env), "agent"),
     ],
 )
 def test_an_agent_that_cannot_work_is_refused(make, field):
@@ -341,11 +338,6 @@ def test_a_name_or_a_class_is_answered_with_an_object(agent, written):
 
 
 def test_an_agent_may_fit_every_task():
-    @dataclasses.dataclass(frozen=True)
-    class Fixed(AgentConfig):
-        def make(self, task):
-            return parts(PLAIN[0])[1]
-
     assert Fixed().steps_before_learning(200, 200) == 0
     for task in (CARTPOLE, ROOM, envs.make("pendulum")):
-        assert isinstance(sejax.make_agent(Fixed(), task), sejax.Agent)
+        assert isinstance(make_agent(Fixed(), task), sejax.Agent)

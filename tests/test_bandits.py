@@ -77,23 +77,24 @@ def test_a_table_of_noise_has_the_units_of_the_task_and_the_actions_of_the_polic
     assert np.allclose(car.states.std(0), [0.45, 0.035], rtol=0.15)  # half of each bound
 
 
-def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
-    """Two of twenty, though nineteen have the return of the tenth quantile."""
-    made = {"source": ["by_hand"], "group": "hand-00", "real_steps": 2000.0, "cpu_s": 0.0,
-            "policy_return": 200.0}  # fmt: skip
-    students = {"source": "by_hand", "group": "hand-00", "kind": "ddqn", "hparams": "default",
-                "agent": range(20), "steps": 2000, "test_return": [100] + [200] * 19}  # fmt: skip
+def summary(source, group, returns, **maker):
+    """The row of DDQN agents of these returns that learned from one thing."""
+    made = {"source": [source], "group": group, "real_steps": 7, "cpu_s": 1.0} | maker
+    students = {"source": source, "group": group, "kind": "ddqn", "hparams": "default",
+                "agent": range(len(returns)), "steps": 2000, "test_return": returns}  # fmt: skip
     rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
     (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
+    return row
+
+
+def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
+    """Two of twenty, though nineteen have the return of the tenth quantile."""
+    row = summary("by_hand", "hand-00", [100] + [200] * 19, policy_return=200.0)
     assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100
 
 
 def test_an_se_is_summed_up_without_bandits():
-    made = {"source": ["evolved"], "group": ["shipped"], "real_steps": [7], "cpu_s": [1.0]}
-    students = {"source": "evolved", "group": "shipped", "kind": "ddqn", "hparams": "default",
-                "agent": range(5), "steps": 2000, "test_return": [150] * 5}  # fmt: skip
-    rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
-    (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
+    row = summary("evolved", "shipped", [150] * 5)
     assert (row.test_return_mean, row.real_steps) == (150, 7) and np.isnan(row.policy_return)
 
 

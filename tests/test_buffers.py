@@ -72,14 +72,6 @@ def test_a_full_buffer_overwrites_its_oldest_rows():
     np.testing.assert_array_equal(actions, [5, 6, 7, 3, 4])
 
 
-def test_rows_not_yet_written_are_never_drawn():
-    rows = filled(2)
-    for seed in range(20):
-        batch = sample(rows, np.uint32(seed), np.int32(2), 8)
-        assert set(np.asarray(batch.action).tolist()) <= {0, 1}
-        assert (np.asarray(batch.reward) >= 0.5).all()  # an empty row has reward 0
-
-
 def test_more_steps_than_rows_count_as_a_full_buffer():
     rows = filled(8)
     batch = sample(rows, np.uint32(0), np.int32(8), 200)
@@ -136,14 +128,6 @@ def test_consecutive_seeds_draw_unrelated_batches():
     draws = [np.asarray(sample_indices(np.uint32(seed), np.int32(1000), 100)) for seed in range(20)]
     equal = [np.mean(a == b) for i, a in enumerate(draws) for b in draws[:i]]
     assert np.mean(equal) < 0.01  # 1 in 1000 by chance
-
-
-def test_buffers_of_several_lanes_are_independent():
-    rows = np.stack([filled(4), filled(2)])
-    steps, active = np.int32([4, 2]), np.array([True, False])
-    many = jax.jit(jax.vmap(store, (0, 0, None, 0)))(rows, steps, transition(9), active)
-    np.testing.assert_array_equal(many[0], store(rows[0], steps[0], transition(9)))
-    np.testing.assert_array_equal(many[1], rows[1])
 
 
 def test_a_batch_is_filled_up_with_columns_of_no_weight():

@@ -1,17 +1,14 @@
-"""sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
+"""sejax.agents.exploration: the bonus by a plain loop, and in a training."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import paper_training
+from test_tabular import step, trained
 
 from sejax import envs
-from sejax.agents.buffers import Transition
 from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
-from sejax.evaluation import make_tester
-from sejax.training import make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
@@ -26,36 +23,12 @@ def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTI
     return with_count_bonus(plain, config, num_states, num_actions)
 
 
-def step(obs, action, reward, discount=0.0, next_obs=0):
-    return Transition(
-        obs=np.int32(obs), action=np.int32(action), reward=np.float32(reward),
-        discount=np.float32(discount), next_obs=np.int32(next_obs),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("power", [1.0, 0.5])
-def test_the_bonus_falls_with_the_visits_of_a_pair_or_their_root(power):
-    # With learning rate 1 and nothing to follow, a value is the last reward with its bonus.
-    plain = make_tabular(QLearningConfig(learning_rate=1.0), NUM_STATES, NUM_ACTIONS)
-    agent = counting(plain, power=power)
-    update = jax.jit(agent.update)
-    state = agent.init(KEY, agent.hparams)
-    np.testing.assert_array_equal(state.counts, np.zeros((3, 2)))
-    steps = [(1, 0, 2.0), (1, 0, 2.0), (1, 1, -1.0), (2, 0, 0.0), (1, 0, 2.0), (1, 0, 2.0)]
-    seen = []
-    for obs, action, reward in steps:
-        state = update(KEY, state, step(obs, action, reward))
-        seen.append(float(state.agent_state.q_values[obs, action]))
-    # Visits so far: 1, 2, 1 (the other action), 1 (another state), 3, 4.
-    expected = [2.5, 2 + 0.5 / 2**power, -0.5, 0.5, 2 + 0.5 / 3**power, 2 + 0.5 / 4**power]
-    np.testing.assert_allclose(seen, expected, rtol=1e-6)
-    np.testing.assert_array_equal(state.counts, [[0, 0], [4, 1], [1, 0]])
-
-
-@pytest.mark.parametrize("config", [QLearningConfig, SARSAConfig])
-def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config):
+@pytest.mark.parametrize(
+    ("config", "power"), [(QLearningConfig, 1.0), (SARSAConfig, 1.0), (QLearningConfig, 0.5)]
+)
+def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config, power):
     plain = make_tabular(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS)
-    agent = counting(plain)
+    agent = counting(plain, power=power)
     rng = np.random.default_rng(0)
     state, expected = agent.init(KEY, agent.hparams), plain.init(KEY, plain.hparams)
     update, plain_update = jax.jit(agent.update), jax.jit(plain.update)
@@ -65,7 +38,7 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config):
         action, reward = rng.integers(0, NUM_ACTIONS), rng.normal()
         discount = rng.choice([0.0, 1.0, 0.7])
         counts[obs, action] += 1
-        paid = reward + BETA / counts[obs, action]
+        paid = reward + BETA / counts[obs, action] ** power
         state = update(key, state, step(obs, action, reward, discount, next_obs))
         expected = plain_update(key, expected, step(obs, action, paid, discount, next_obs))
     np.testing.assert_array_equal(state.counts, counts)
@@ -92,16 +65,7 @@ def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bo
     task = envs.make("cliff_walking")
     plain = make_tabular(QLearningConfig(warmup_episodes=2), 48, 4)
     agent = counting(plain, 0.1, 48, 4)
-    config = paper_training(max_episodes=200, stop_rule="never")
-    train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)
-
-    @jax.jit
-    @jax.vmap
-    def run(key):
-        result = train(key, task.params)
-        return result, test(key, result.agent_state)[0][0]
-
-    result, test_returns = run(jax.random.split(KEY, 4))
+    result, test_returns = trained(agent, task, num_episodes=200, num_agents=4)
     np.testing.assert_array_equal(test_returns, -12.0)
     returns = np.asarray(result.returns)
     np.testing.assert_array_equal(returns, np.round(returns))

@@ -1,4 +1,4 @@
-"""sejax.agents.dqn: targets by hand, updates against torch, exploration, and a probe MDP."""
+"""sejax.agents.dqn: updates against torch, exploration, and a probe MDP."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,10 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_shares, drawing, numpy_forward, shapes_of, train_on, unraveled
+from support import (
+    assert_shares,
+    drawing,
+    numpy_forward,
+    random_columns,
+    shapes_of,
+    train_on,
+    unraveled,
+)
 
 from sejax.agents.buffers import Transition
-from sejax.agents.dqn import DDQNConfig, double_q_targets, make_ddqn
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
@@ -27,16 +35,10 @@ CASES = {activation: replace(CONFIG, activation=activation) for activation in EX
 }  # fmt: skip
 
 
-def random_batch(seed, discount=None):
+def random_batch(seed):
     rng = np.random.default_rng(seed)
-    columns = {
-        "obs": rng.normal(size=(OBS_DIM, BATCH)),
-        "reward": rng.normal(size=BATCH),
-        "discount": rng.uniform(-0.2, 1.2, BATCH) if discount is None else np.full(BATCH, discount),
-        "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
-    }
-    action = np.int32(rng.integers(0, NUM_ACTIONS, BATCH))
-    return Transition(action=action, **{k: np.float32(v) for k, v in columns.items()})
+    columns = random_columns(rng, OBS_DIM, BATCH)
+    return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
 
 
 @pytest.fixture(scope="module")
@@ -73,30 +75,11 @@ def assert_updates_equal_torchs(golden, case, agent):
                 np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
 
 
-def q_network(config):
-    """The agent's network and the function from its flat parameters to the nested ones."""
-    net = MLP(
-        NUM_ACTIONS, config.hidden_size, config.num_layers, config.activation,
-        learn_prelu_slope=True,
-    )  # fmt: skip
-    template = shapes_of(net.init, jax.random.key(0), np.zeros(OBS_DIM))
-    return net, lambda flat: unraveled(flat, template)["params"]
-
-
-# --- the targets, by hand ------------------------------------------------------------------------
-
-
-def test_targets_take_the_online_networks_action_and_the_target_networks_value():
-    # Columns are next states, rows actions.
-    online = jnp.array(
-        [[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]]
-    )  # best actions: 1, 0, 0 (first of equals)
-    target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])  # values there: 40, 20, 30
-    reward = jnp.array([1.0, -1.0, 0.5])
-    discount = jnp.array([0.9, 0.5, 0.0])
-    # 1 + 0.9 * 40 = 37;  -1 + 0.5 * 20 = 9;  0.5 + 0 * 30 = 0.5.
-    # Taking the maximum of the target network instead would give 37, 24 and 0.5.
-    np.testing.assert_allclose(double_q_targets(online, target, reward, discount), [37.0, 9.0, 0.5])
+def nested_params(config):
+    """Turns the agent's flat parameters into the network's nested ones."""
+    init = config.network(NUM_ACTIONS).init
+    template = shapes_of(init, jax.random.key(0), np.zeros(OBS_DIM))
+    return lambda flat: unraveled(flat, template)["params"]
 
 
 # --- updates against torch -----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""sejax.agents.ppo: advantages and loss by hand, phases against torch, lanes, and probes."""
+"""sejax.agents.ppo: phases against torch, minibatches, lanes, policies, and a probe."""
 
 import dataclasses
 import functools
@@ -11,7 +11,16 @@ import numpy as np
 import optax
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import assert_shares, drawing, numpy_forward, raveled, shapes_of, unraveled
+from support import (
+    assert_close,
+    assert_equal,
+    assert_shares,
+    drawing,
+    numpy_forward,
+    raveled,
+    shapes_of,
+    unraveled,
+)
 
 from sejax.agents import buffers
 from sejax.agents.base import traced
@@ -20,8 +29,6 @@ from sejax.agents.policies import gaussian, softmax
 from sejax.agents.ppo import (
     MIN_STD,
     PPOConfig,
-    discounted_returns,
-    generalized_advantages,
     make_ppo,
     normalized,
     ppo_loss,
@@ -110,50 +117,19 @@ def state_of(agent):
     return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def kind(request):
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def agent(kind):
-    return ppo(kind)
-
-
-@pytest.fixture(scope="module")
-def state(agent):
-    return state_of(agent)
-
-
-@pytest.fixture(scope="module")
-def update(agent):
+@functools.cache
+def update_of(agent):
     return jax.jit(agent.update)
+
+
+every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def adam_steps(state):
     return optax.tree.get(state.opt_state, "count")
 
 
-def assert_equal(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
-# --- returns -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ends", [(), ENDS, (STEPS - 1,), range(STEPS)])
-def test_returns_equal_a_plain_loop(ends):
-    reward = np.random.default_rng(0).normal(size=STEPS).astype(np.float32)
-    ended = np.zeros(STEPS, np.float32)
-    ended[list(ends)] = 1.0
-    expected = np.zeros(STEPS)
-    for start in range(STEPS):
-        for step in range(start, STEPS):
-            expected[start] += 0.9 ** (step - start) * reward[step]
-            if ended[step]:
-                break
-    got = jax.jit(discounted_returns)(reward, ended, 0.9)
-    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+# --- returns and minibatches ---------------------------------------------------------------------
 
 
 def test_normalized_returns_have_mean_zero_and_std_one():
@@ -162,46 +138,6 @@ def test_normalized_returns_have_mean_zero_and_std_one():
     np.testing.assert_allclose(got(np.float32([1, 2, 3])), [-1, 0, 1], rtol=2e-5)
     np.testing.assert_array_equal(got(np.float32([3, 3, 3])), 0.0)
     np.testing.assert_array_equal(got(np.float32([3])), 0.0)
-
-
-# --- advantages ----------------------------------------------------------------------------------
-
-
-def advantages_by_definition(steps, ended, value, next_value, gamma, gae_lambda):
-    """Each step's sum of discounted one-step errors, in plain loops over what follows it."""
-    expected = np.zeros(len(ended))
-    for start in range(len(ended)):
-        weight = 1.0
-        for t in range(start, len(ended)):
-            decay = gamma * steps.discount[t]
-            expected[start] += weight * (steps.reward[t] + decay * next_value[t] - value[t])
-            weight *= decay * gae_lambda
-            if ended[t]:
-                break
-    return expected
-
-
-# What the steps at which episodes end bootstrap with: nothing, if they terminated; fully, if they
-# were truncated. The rollout's last step does so whether its episode has ended or not.
-@pytest.mark.parametrize(
-    "ends, at_ends", [((), None), (ENDS, 0.0), (ENDS, 1.0), (range(STEPS), 0.0), (ENDS, None)]
-)
-def test_generalized_advantages_equal_plain_loops(ends, at_ends):
-    steps, ended = random_steps("gae", 0)
-    rng = np.random.default_rng(1)
-    value, next_value = np.float32(rng.normal(size=(2, STEPS)))
-    ended = np.isin(np.arange(STEPS), list(ends)).astype(np.float32)
-    if at_ends is not None:  # elsewhere 1, as in any task
-        steps = steps._replace(discount=np.where(ended, at_ends, 1.0).astype(np.float32))
-    decay = np.float32(0.9) * steps.discount
-    got = jit_advantages(steps.reward, decay, ended, value, next_value, 0.8)
-    expected = advantages_by_definition(steps, ended, value, next_value, 0.9, 0.8)
-    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
-    if len(ends) == STEPS:  # a world of single steps
-        np.testing.assert_allclose(got, steps.reward - value, rtol=1e-6)
-
-
-jit_advantages = jax.jit(generalized_advantages)
 
 
 def test_each_epoch_learns_from_each_step_once_and_in_an_order_of_its_own():
@@ -215,37 +151,6 @@ def test_each_epoch_learns_from_each_step_once_and_in_an_order_of_its_own():
 
 
 # --- the loss ------------------------------------------------------------------------------------
-
-
-def loss_inputs():
-    """Columns on both sides of the clip with advantages of both signs."""
-    rng = np.random.default_rng(3)
-    names = ("log_prob", "entropy", "value", "old_log_prob", "returns")
-    inputs = {name: np.float32(rng.normal(size=STEPS)) for name in names}
-    return inputs | {"old_log_prob": inputs["log_prob"] + np.float32(0.2) * inputs["old_log_prob"]}
-
-
-def test_loss_by_hand():
-    hp = HPARAMS._replace(clip_ratio=0.2, value_weight=0.5, entropy_weight=0.1)
-    # Ratios 2, 2, 0.5, 0.5 and advantages 1, -1, 1, -1. The smaller of the ratio's and of the
-    # clipped ratio's product: min(2, 1.2), min(-2, -1.2), min(0.5, 0.8), min(-0.5, -0.8); mean
-    # (1.2 - 2 + 0.5 - 0.8) / 4 = -0.275. Value error 1, entropy 3: 0.275 + 0.5 - 0.3 = 0.475.
-    log_prob = np.log(np.float32([2.0, 2.0, 0.5, 0.5]))
-    returns, zeros = np.float32([1.0, -1.0, 1.0, -1.0]), np.zeros(4, np.float32)
-    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, returns, hp)
-    np.testing.assert_allclose(loss, 0.475, rtol=1e-6)
-
-
-def test_loss_and_gradients_equal_torchs():
-    golden = np.load(GOLDEN)  # made by torch_ppo.py
-    inputs = loss_inputs()
-    others = {name: inputs.pop(name) for name in ("old_log_prob", "returns")}
-    others["advantage"] = others["returns"] - inputs["value"]
-    loss_fn = jax.jit(jax.value_and_grad(lambda x: ppo_loss(**x, **others, hp=HPARAMS)))
-    loss, gradients = loss_fn(inputs)
-    np.testing.assert_allclose(loss, golden["loss"], rtol=1e-6)
-    for name, gradient in gradients.items():
-        np.testing.assert_allclose(gradient, golden[f"loss/{name}"], rtol=1e-5, atol=1e-7)
 
 
 def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
@@ -264,18 +169,19 @@ def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
 # --- phases --------------------------------------------------------------------------------------
 
 
-def test_learning_phases_equal_torchs(kind, state, update):
-    golden = np.load(GOLDEN)
-    state = state.replace(params=golden[f"{kind}/params/0"])
+@every_kind
+def test_learning_phases_equal_torchs(kind):
+    golden = np.load(GOLDEN)  # made by torch_ppo.py
+    state = state_of(ppo(kind)).replace(params=golden[f"{kind}/params/0"])
     for number in (1, 2):
-        state = update(KEY, state, rollout(kind, number))
+        state = update_of(ppo(kind))(KEY, state, rollout(kind, number))
         expected = golden[f"{kind}/params/{number}"]
         np.testing.assert_allclose(state.params, expected, rtol=2e-5, atol=5e-6)
 
 
 def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
     agent = ppo("gae")
-    state, update = state_of(agent), jax.jit(agent.update)
+    state, update = state_of(agent), update_of(agent)
     steps, ended = random_steps("gae", 0)
     paid_more = np.asarray(jit_pack(steps._replace(reward=1000 * steps.reward), ended))
     more = update(KEY, state, Rollout(paid_more, np.bool_(True)))
@@ -287,26 +193,16 @@ def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
     assert np.isfinite(update(KEY, state, Rollout(always, np.bool_(True))).params).all()
 
 
-def test_lanes_learn_as_they_would_alone(kind, agent, state, update):
-    # With their own parameters and learning rates; the second one's rollout is not full.
-    rates = (0.05, 0.05, 0.01)
-    num_parallel = [
-        state.replace(params=np.asarray(state.params) * np.float32(scale),
-                      hparams=state.hparams._replace(learning_rate=np.float32(rate)))
-        for scale, rate in zip((1.0, 0.8, -1.2), rates, strict=True)
-    ]  # fmt: skip
+@every_kind
+def test_a_lane_whose_rollout_is_not_full_waits_for_the_others(kind):
+    agent, state = ppo(kind), state_of(ppo(kind))
     rollouts = [rollout(kind, seed, seed != 1) for seed in range(3)]
-    states, stacked = (
-        jax.tree.map(lambda *x: np.stack(x), *each) for each in (num_parallel, rollouts)
-    )
-    together = jax.jit(jax.vmap(agent.update, (None, 0, 0)))(KEY, states, stacked)
-    together = jax.tree.map(np.asarray, together)
-    for lane, (before, own) in enumerate(zip(num_parallel, rollouts, strict=True)):
-        got, alone = jax.tree.map(lambda x: x[lane], together), update(KEY, before, own)  # noqa: B023
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), got, alone
-        )
-        assert (lane == 1) == bool((got.params == before.params).all())
+    stacked = jax.tree.map(lambda *x: np.stack(x), *rollouts)
+    together = jax.jit(jax.vmap(agent.update, (None, None, 0)))(KEY, state, stacked)
+    for lane, own in enumerate(rollouts):
+        got, alone = jax.tree.map(lambda x: x[lane], together), update_of(agent)(KEY, state, own)  # noqa: B023
+        assert_close(got, alone, rtol=1e-4, atol=1e-6)
+        assert (lane == 1) == bool((got.params == state.params).all())
 
 
 @pytest.mark.parametrize("kind, epochs", [("discrete", 10**9), ("gae", 7)])
@@ -325,13 +221,12 @@ def test_a_step_without_a_phase_does_none_of_its_work(kind, epochs):
 
 def test_the_std_stops_at_its_floor_and_can_grow_again():
     agent = ppo("continuous")
-    update = jax.jit(agent.update)
     _, _, unravel = networks("continuous")
 
     def learn(state, entropy_weight):
         hparams = state.hparams._replace(entropy_weight=np.float32(entropy_weight),
                                          learning_rate=np.float32(0.05))  # fmt: skip
-        return update(KEY, state.replace(hparams=hparams), rollout("continuous"))
+        return update_of(agent)(KEY, state.replace(hparams=hparams), rollout("continuous"))
 
     state = state_of(agent)
     params = {**unravel(state.params), "std": np.full(ACTION_DIM, 0.1, np.float32)}
@@ -342,7 +237,9 @@ def test_the_std_stops_at_its_floor_and_can_grow_again():
     assert (unravel(state.params)["std"] > 2 * MIN_STD).all()
 
 
-def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
+@every_kind
+def test_a_phase_starts_with_the_step_that_fills_the_rollout(kind):
+    agent = ppo(kind)
     state, obs, zero = state_of(agent), np.zeros(OBS_DIM, np.float32), np.float32(0)
     action = jax.eval_shape(functools.partial(agent.act, explore=True), KEY, state, obs)
     example = Transition(obs, np.zeros(action.shape, action.dtype), zero, zero, obs)
@@ -362,7 +259,7 @@ def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
     run = jax.jit(lambda state: jax.lax.scan(step, (buffer.init(), state),
                                              np.arange(2 * STEPS + 3))[1])  # fmt: skip
     counts = run(state)
-    phase = CONFIG.epochs * (3 if agent is ppo("gae") else 1)
+    phase = CONFIG.epochs * (3 if kind == "gae" else 1)
     expected = [0] * (STEPS - 1) + [phase] * STEPS + [2 * phase] * 4
     np.testing.assert_array_equal(counts, expected)
 
@@ -434,21 +331,6 @@ def test_continuous_actions_are_clipped_for_the_world_only():
     np.testing.assert_array_equal(
         agent.env_action(actions), np.clip(actions, -MAX_ACTION, MAX_ACTION)
     )
-
-
-def test_log_probabilities_and_entropies_by_hand():
-    # Odds 1 : 3, hence probabilities 1/4 and 3/4; entropy -(ln(1/4) + 3 ln(3/4)) / 4.
-    outputs = np.log(np.float32([[1.0, 1.0], [3.0, 3.0]]))
-    log_prob, entropy = jax.jit(softmax(2).evaluate)(outputs, np.zeros(0), np.array([0, 1]))
-    np.testing.assert_allclose(np.exp(log_prob), [0.25, 0.75], rtol=1e-6)
-    np.testing.assert_allclose(entropy, -(np.log(0.25) + 3 * np.log(0.75)) / 4, rtol=1e-6)
-    # Means 0 and std 0.5, 2. The action (1, 2) is 2 and 1 deviations off:
-    # density exp(-(4 + 1) / 2) / (2 pi * 0.5 * 2). Entropy ln(2 pi e * 0.5 * 2).
-    std, action = np.float32([0.5, 2.0]), np.float32([[1.0], [2.0]])
-    evaluate = jax.jit(gaussian(2, MAX_ACTION).evaluate)
-    log_prob, entropy = evaluate(np.zeros((2, 1), np.float32), std, action)
-    np.testing.assert_allclose(np.exp(log_prob), np.exp(-2.5) / (2 * np.pi), rtol=1e-6)
-    np.testing.assert_allclose(entropy, [np.log(2 * np.pi) + 1], rtol=1e-6)
 
 
 # --- probes --------------------------------------------------------------------------------------

@@ -36,11 +36,6 @@ def step():
     return {done: build(done) for done in ("soft", "threshold", "bernoulli", "sigmoid")}
 
 
-def constant_weights(state, reward, done):
-    """Weights with which the three outputs are these constants, whatever the input."""
-    return constant_heads(make_env(), state=state, reward=reward, done=done)
-
-
 def constant_heads(env, **values):
     """Weights of an SE with which the networks named have constant outputs, and others 0."""
     shapes = jax.eval_shape(env.init_weights, jax.random.key(0))
@@ -87,14 +82,6 @@ def test_predict_equals_three_separate_mlps_fed_the_one_hot_action_first(task):
         np.testing.assert_allclose(done, expected["done"][0], rtol=1e-5, atol=1e-6)
 
 
-def test_the_networks_differ_in_their_outputs_alone():
-    env = make_env()
-    weights = env.init_weights(jax.random.key(0))
-    for head, outputs in {"state": 4, "reward": 1, "done": 1}.items():
-        shapes = [weights[head][f"Dense_{i}"]["kernel"].shape for i in range(3)]
-        assert shapes == [(5, 6), (5, 5), (outputs, 5)]  # 2 actions + 4 numbers of state
-
-
 def test_the_papers_se_for_cartpole_has_2247_parameters():
     # (6 * 83 + 83) * 3 for the hidden layers, (83 + 1) * (4 + 1 + 1) for the heads:
     # 1743 + 504 = 2247, as the authors' networks have.
@@ -103,22 +90,16 @@ def test_the_papers_se_for_cartpole_has_2247_parameters():
     assert sum(x.size for x in jax.tree.leaves(weights)) == 2247
 
 
-def test_a_step_moves_to_the_predicted_state_itself(step):
-    weights = make_env().init_weights(jax.random.key(5))
-    next_obs, reward, _ = make_env().predict(weights, OBS, jnp.int32(1))
-    obs, state, got_reward, _, _ = step["soft"](weights)
-    np.testing.assert_allclose(obs, next_obs, rtol=1e-6)
-    np.testing.assert_array_equal(state.vector, obs)
-    np.testing.assert_allclose(got_reward, reward, rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("done", "terminates"), [(-3.0, False), (0.0, False), (0.5, False), (0.501, True), (7.0, True)]
 )
 @pytest.mark.parametrize("mode", ["soft", "threshold"])
 def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode, done, terminates):
-    _, _, reward, terminated, info = step[mode](constant_weights(1.0, 2.0, done))
+    obs, state, reward, terminated, info = step[mode](
+        constant_heads(make_env(), state=1.0, reward=2.0, done=done)
+    )
     assert terminated == terminates
+    assert (obs == 1.0).all() and (state.vector == 1.0).all()  # the predicted state itself
     assert reward == 2.0  # the reward of the last step counts
     # soft: 1 - d, not confined to [0, 1]; threshold: 1 - [d > 0.5].
     expected = 1.0 - done if mode == "soft" else 1.0 - terminates
@@ -140,7 +121,7 @@ def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode
 )  # fmt: skip
 @pytest.mark.parametrize("mode", ["soft", "threshold", "bernoulli", "sigmoid"])
 def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode, outputs):
-    weights = constant_weights(**{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs})
+    weights = constant_heads(make_env(), **{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs})
     obs, state, reward, terminated, info = step[mode](weights)
     np.testing.assert_array_equal(obs, OBS)
     np.testing.assert_array_equal(state.vector, OBS)
@@ -152,10 +133,10 @@ def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode,
 
 
 def test_outputs_just_below_absurd_are_a_world(step):
-    weights = constant_weights(0.99 * MAX_ABS_VALUE, 0.99 * MAX_ABS_VALUE, 0.0)
+    large = np.float32(0.99 * MAX_ABS_VALUE)
+    weights = constant_heads(make_env(), state=large, reward=large)
     obs, _, reward, terminated, info = step["soft"](weights)
-    np.testing.assert_allclose(obs, 0.99 * MAX_ABS_VALUE)
-    np.testing.assert_allclose(reward, 0.99 * MAX_ABS_VALUE)
+    assert (obs == large).all() and reward == large
     assert not terminated and not info["nonfinite"]
 
 
@@ -287,69 +268,40 @@ def walk(env, weights, num_steps=3):
     return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_steps))[1]
 
 
+THRESHOLD, LATE = {"done": "threshold"}, {"min_steps": 3}
+ENDING, CUT = {"horizon": 3}, {"horizon": 3, "horizon_is_terminal": False}
+NO, LAST = [False] * 3, [False, False, True]
+
+
 @pytest.mark.parametrize(
-    ("done", "is_terminal", "discounts"),
+    ("config", "outputs", "terminated", "truncated", "discounts"),
     [
         # d = 0.25 ends nothing. Soft: targets bootstrap with 0.75, at a terminal horizon with 0.
-        ("soft", True, [0.75, 0.75, 0]),
-        ("soft", False, [0.75, 0.75, 0.75]),
-        ("threshold", True, [1, 1, 0]),
-        ("threshold", False, [1, 1, 1]),
-    ],
-)
-def test_a_horizon_terminates_an_episode_or_cuts_it(done, is_terminal, discounts):
-    env = make_env(done=done, horizon=3, horizon_is_terminal=is_terminal)
-    terminated, truncated, discount = walk(env, constant_heads(env, done=0.25))
-    np.testing.assert_array_equal(terminated, [False, False, is_terminal])
-    np.testing.assert_array_equal(truncated, [False, False, not is_terminal])  # as in sejax.gym
-    np.testing.assert_allclose(discount, discounts)
-    assert not is_real(env) and episode_limit(env) == 3
-    assert env.default_params.max_steps_in_episode == 3
-
-
-def test_a_done_output_ends_an_episode_before_its_horizon():
-    env = make_env(done="threshold", horizon=3)
-    terminated, truncated, discount = walk(env, constant_heads(env, done=0.6), num_steps=1)
-    assert terminated[0] and not truncated[0] and discount[0] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("done", "d", "terminated", "discounts"),
-    [
+        (ENDING, {"done": 0.25}, LAST, NO, [0.75, 0.75, 0]),
+        (CUT, {"done": 0.25}, NO, LAST, [0.75, 0.75, 0.75]),
+        (ENDING | THRESHOLD, {"done": 0.25}, LAST, NO, [1, 1, 0]),
+        (CUT | THRESHOLD, {"done": 0.25}, NO, LAST, [1, 1, 1]),
+        (ENDING | THRESHOLD, {"done": 0.6}, [True], [False], [0]),  # before the horizon
         # Steps 1 and 2 end nothing, whatever d says; step 3 is as it would be without min_steps=3.
-        ("threshold", 1.0, [False, False, True], [1, 1, 0]),
-        ("threshold", 0.0, [False, False, False], [1, 1, 1]),
-        ("bernoulli", 1.0, [False, False, True], [1, 1, 0]),
-        ("sigmoid", 50.0, [False, False, True], [1, 1, 0]),
-        ("soft", 0.25, [False, False, False], [1, 1, 0.75]),
-        ("soft", 1.5, [False, False, True], [1, 1, -0.5]),
+        (LATE | THRESHOLD, {"done": 1.0}, LAST, NO, [1, 1, 0]),
+        (LATE | THRESHOLD, {"done": 0.0}, NO, NO, [1, 1, 1]),
+        (LATE | {"done": "bernoulli"}, {"done": 1.0}, LAST, NO, [1, 1, 0]),
+        (LATE | {"done": "sigmoid"}, {"done": 50.0}, LAST, NO, [1, 1, 0]),
+        (LATE, {"done": 0.25}, NO, NO, [1, 1, 0.75]),
+        (LATE, {"done": 1.5}, LAST, NO, [1, 1, -0.5]),
+        (LATE, {"reward": np.nan}, [True], [False], [0]),  # absurd
     ],
+    ids=str,
 )
-def test_no_done_output_ends_an_episode_before_its_least_number_of_steps(
-    done, d, terminated, discounts
-):
-    env = make_env(done=done, min_steps=3)
-    ended, truncated, discount = walk(env, constant_heads(env, done=d))
-    np.testing.assert_array_equal(ended, terminated)
-    np.testing.assert_allclose(discount, discounts)
-    assert not truncated.any()
-
-
-def test_an_absurd_output_ends_an_episode_before_its_least_number_of_steps():
-    env = make_env(done="soft", min_steps=3)
-    terminated, _, discount = walk(env, constant_heads(env, reward=np.nan), num_steps=1)
-    assert terminated[0] and discount[0] == 0
-
-
-def test_an_episode_begins_anew_after_its_horizon():
-    env = make_env(done="threshold", horizon=2)
-    params = env.params(constant_heads(env, state=0.7))
-    _, state = env.reset(jax.random.key(0), params)
-    for time in (1, 0):
-        obs, state, _, terminated, truncated, info = env.step(jax.random.key(1), state, 0, params)
-        assert state.time == time and terminated == (time == 0) and not truncated
-    np.testing.assert_allclose(info["final_observation"], 0.7)
-    assert np.abs(obs).max() <= 0.05
+def test_horizons_and_least_numbers_of_steps(config, outputs, terminated, truncated, discounts):
+    env = make_env(**config)
+    walked = walk(env, constant_heads(env, **outputs), num_steps=len(terminated))
+    np.testing.assert_array_equal(walked[0], terminated)
+    np.testing.assert_array_equal(walked[1], truncated)  # as in sejax.gym
+    np.testing.assert_allclose(walked[2], discounts)
+    limit = config.get("horizon", 200)
+    assert not is_real(env) and episode_limit(env) == limit
+    assert env.default_params.max_steps_in_episode == limit
 
 
 @pytest.mark.parametrize("done", ["soft", "threshold", "bernoulli", "sigmoid"])
@@ -401,7 +353,7 @@ def test_initial_states_are_the_real_tasks(task):
 def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
     env = make_env()
     # d = 0.25 never terminates: the episode runs to the real task's limit.
-    params = env.params(constant_weights(0.7, 1.5, 0.25))
+    params = env.params(constant_heads(env, state=0.7, reward=1.5, done=0.25))
     assert params.max_steps_in_episode == 200
     obs, state = env.reset(jax.random.key(0), params)
     for t in range(1, 4):
@@ -416,22 +368,6 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
     assert info["discount"] == 0.75  # a learned discount: the limit itself does not cut it
     np.testing.assert_allclose(info["final_observation"], 0.7)
     assert state.time == 0 and np.abs(obs).max() <= 0.05  # the next episode has begun
-
-
-def test_weights_are_traced_so_that_many_proxies_step_at_once():
-    env = make_env()
-    keys = jax.random.split(jax.random.key(0), 3)
-    each = [env.init_weights(key) for key in keys]
-    weights = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _, state = env.reset(keys[0], env.default_params)
-    step = jax.jit(jax.vmap(lambda w: env.step_env(keys[0], state, 1, env.params(w))[:3]))
-    obs, _, reward = step(weights)
-    assert obs.shape == (3, 4)
-    predict = jax.jit(env.predict)
-    for i in range(3):
-        expected_obs, expected_reward, _ = predict(each[i], state.vector, jnp.int32(1))
-        np.testing.assert_allclose(obs[i], expected_obs, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(reward[i], expected_reward, rtol=1e-5, atol=1e-6)
 
 
 def test_spaces_and_names_are_those_of_the_task():

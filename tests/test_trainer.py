@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
-from support import numpy_forward, paper_se, paper_training
+from support import assert_close, paper_se, paper_training
 
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
@@ -61,7 +61,7 @@ def trainers():
     """Jitted scripted trainings by variant: `(key, env_params, weight=0, active=True)`."""
 
     def build(name, config):
-        agent = scripted_agent(INIT_EPISODES, buffer_size=5 if name == "solved" else 1000)
+        agent = scripted_agent(INIT_EPISODES)
         train = jax.jit(
             make_trainer(agent, ENV, config, solved_reward=SOLVED, test_fn=scripted_test)
         )
@@ -107,6 +107,8 @@ scripts = st.tuples(
 
 @pytest.mark.parametrize("variant", ["never", "plateau", "solved", "patient"])
 @given(scripted=scripts)
+@example(scripted=([3] * 12, [1] * 12))  # flat, or solved, as soon as the rule may say so
+@example(scripted=([2**n for n in range(12)], [1] * 12))  # never flat
 def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
     returns, lengths = scripted
     rule = VARIANTS[variant].stop_rule
@@ -117,22 +119,11 @@ def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
     expected = np.full(MAX_EPISODES, np.nan)
     expected[: len(history)] = history
     np.testing.assert_array_equal(result.returns, expected)
+    expected[: len(history)] = np.cumsum(np.minimum(lengths, MAX_STEPS))[: len(history)]
+    np.testing.assert_array_equal(result.episode_ends, np.nan_to_num(expected))
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
     assert result.eval_steps == 0
-
-
-@pytest.mark.parametrize(
-    ("variant", "returns", "episodes"),
-    [
-        # All returns equal: flat at once, but the rule waits for episode index 2 + 2 (the fifth).
-        ("plateau", [3.0] * 12, 5),
-        ("plateau", [2.0**n for n in range(12)], 12),  # growing returns are never flat
-        ("solved", [3.0] * 12, 3),  # after the initial episodes
-    ],
-)
-def test_a_rule_stops_at_the_first_episode_that_it_may(trainers, variant, returns, episodes):
-    assert trainers[variant](KEY, script(returns, [1] * 12)).episodes == episodes
 
 
 def test_tests_between_episodes_decide_and_are_recorded(trainers):
@@ -163,12 +154,6 @@ def test_a_solved_training_that_is_tested_throughout_goes_on():
     assert evaluation.tested_throughout(thrice) == thrice and thrice.num_tests_between == 3
 
 
-def test_learning_starts_with_the_first_episode_after_the_initial_ones(trainers):
-    result = trainers["never"](KEY, script([0] * 12, [3] * 12))
-    assert result.agent_state.first_update_episode == INIT_EPISODES
-    assert result.agent_state.num_updates == 3 * 10
-
-
 def test_a_step_budget_ends_training_within_an_episode(trainers):
     result = trainers["cut"](KEY, script([7] * 12, [4] * 12))
     assert result.train_steps == 17
@@ -177,40 +162,15 @@ def test_a_step_budget_ends_training_within_an_episode(trainers):
     assert result.agent_state.num_updates == 17 - 8
 
 
-@pytest.mark.parametrize("limit", [MAX_STEPS, 2 * MAX_STEPS])  # the world's default, and above
-def test_all_episodes_are_trained_to_the_step_limit(trainers, limit):
-    result = trainers["never"](KEY, script([1] * 12, [99] * 12, max_steps_in_episode=limit))
-    assert result.episodes == 12 and result.train_steps == 12 * limit
+def test_all_episodes_are_trained_to_the_step_limit_of_the_params(trainers):
+    result = trainers["never"](KEY, script([1] * 12, [99] * 12, max_steps_in_episode=7))
+    assert result.episodes == 12 and result.train_steps == 12 * 7
 
 
 def test_tests_need_a_test_function():
     for name in ("tested", "watched"):
         with pytest.raises(ValueError, match="test_fn"):
             make_trainer(scripted_agent(), ENV, VARIANTS[name])
-
-
-def test_a_world_of_one_step_has_an_episode_for_each_step():
-    task = envs.make("gridworld_2x2")
-    env = registry.make("proxy", paper_se(hidden_size=4, horizon=1), task)
-    config = QLearningConfig(learning_rate=1.0, epsilon_init=1.0, epsilon_min=1.0)
-    params = env.params(env.init_weights(KEY))
-    never = training(max_episodes=40, max_steps=40, stop_rule="never")
-    train = make_trainer(registry.make("agent", config, task), env, never)
-    many = jax.jit(jax.vmap(train, (0, None)))(jax.random.split(KEY, 3), params)
-    # The start is one state, so that there is one reward for each action, which is its value.
-    _, start = env.reset_env(KEY, params)
-    rewards = [
-        numpy_forward(params.weights["reward"], [*one_hot, *start.vector], "leaky_relu", 1)[0]
-        for one_hot in np.eye(task.num_actions)
-    ]
-    for i in range(3):
-        assert many.train_steps[i] == many.episodes[i] == 40
-        np.testing.assert_array_equal(many.episode_ends[i], np.arange(1, 41))
-        distance = np.abs(np.subtract.outer(np.asarray(many.returns[i]), rewards))
-        assert distance.min(axis=1).max() < 1e-5
-        assert set(distance.argmin(axis=1)) == set(range(task.num_actions))
-        state = np.argmax(start.vector)
-        np.testing.assert_allclose(many.agent_state.q_values[i, state], rewards, rtol=1e-4)
 
 
 # --- what is stored ------------------------------------------------------------------------------
@@ -241,13 +201,6 @@ def test_the_replay_holds_what_happened_with_the_true_last_observations(trainers
     assert len(rows) > 18
     assert {discount for _, t, _, discount, next_t in rows if next_t == 4} == {1.0}
     assert 0.0 in {discount for *_, discount, _ in rows}
-
-
-def test_a_full_buffer_holds_the_last_transitions(trainers):
-    # Capacity 5, episodes of 2 steps, never solved: the last five of 24 transitions.
-    result = trainers["solved"](KEY, script([0] * 12, [2] * 12))
-    got = {(episode, t) for episode, t, *_ in stored(result)}
-    assert got == {(9, 1), (10, 0), (10, 1), (11, 0), (11, 1)}
 
 
 def test_each_episode_starts_from_a_fresh_reset(trainers):
@@ -311,24 +264,17 @@ def test_an_inactive_training_does_nothing(trainers):
         # One episode: newer is its return, older 0.
         ([0, 0, 0, 5], 1, False),
         ([0, 0, 0, 0], 1, True),
+        # Windows of 3: older (1 + 2 + 3) / 3 = 2, newer (3 + 2 + 1) / 3 = 2.
+        ([1, 2, 3, 3, 2, 1], 6, True),
+        # Five episodes: older (2 + 3) / 2 = 2.5, newer 2; and (2.01 + 2) / 2 = 2.005.
+        ([0, 2, 3, 3, 2, 1], 5, False),
+        ([0, 2.01, 2, 3, 2, 1], 5, True),
+        ([1, 1, 1, np.nan], 4, False),
     ],
 )
 def test_a_plateau_compares_the_last_window_with_the_one_before(recent, num_episodes, flat):
     recent = jnp.array(recent, jnp.float32)
     assert bool(is_plateau(recent, jnp.int32(num_episodes), 0.01)) == flat
-
-
-def test_a_plateau_over_odd_windows_weighs_all_their_returns():
-    # Windows of 3: older (1 + 2 + 3) / 3 = 2, newer (3 + 2 + 1) / 3 = 2.
-    assert is_plateau(jnp.array([1.0, 2, 3, 3, 2, 1]), jnp.int32(6), 0.001)
-    # Five episodes: older (2 + 3) / 2 = 2.5, newer 2: apart by a fifth.
-    recent = jnp.array([0.0, 2, 3, 3, 2, 1])
-    assert is_plateau(recent, jnp.int32(5), 0.21)
-    assert not is_plateau(recent, jnp.int32(5), 0.19)
-
-
-def test_a_nonfinite_return_is_no_plateau():
-    assert not is_plateau(jnp.array([1.0, 1.0, 1.0, jnp.nan]), jnp.int32(4), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -409,8 +355,7 @@ def assert_same(many, index, alone):
     assert lane.episodes == alone.episodes
     assert lane.eval_steps == alone.eval_steps
     assert lane.nonfinite == alone.nonfinite
-    for a, b in zip(jax.tree.leaves(lane), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+    assert_close(lane, alone, rtol=1e-3, atol=1e-4)
 
 
 def scripted_lanes():
@@ -430,30 +375,9 @@ def assert_lanes_are_single_trainings(train, num_parallel, many):
         assert_same(many, i, train(*alone))
 
 
-@pytest.fixture(scope="module")
-def in_lanes(trainers):
-    """The results of `scripted_lanes` by the plateau rule."""
-    return jax.jit(jax.vmap(trainers["plateau"]))(*scripted_lanes())
-
-
-def test_scripted_lanes_equal_single_trainings(trainers, in_lanes):
-    assert_lanes_are_single_trainings(trainers["plateau"], scripted_lanes(), in_lanes)
-
-
-def test_a_lanes_curve_has_its_own_episodes_and_nothing_after_them(in_lanes):
-    _, params, _, active = scripted_lanes()
-    for i in range(5):  # the sixth meets a number that is none
-        history, lengths = [], np.minimum(params.lengths[i], MAX_STEPS)
-        if active[i]:
-            history, _, _ = plain_training(
-                params.returns[i].tolist(), params.lengths[i].tolist(), "plateau"
-            )
-        num, rest = len(history), MAX_EPISODES - len(history)
-        ends = np.cumsum(lengths)[:num].tolist()
-        np.testing.assert_array_equal(in_lanes.returns[i], history + [np.nan] * rest)
-        np.testing.assert_array_equal(in_lanes.episode_ends[i], ends + [0] * rest)
-    np.testing.assert_array_equal(in_lanes.returns[5], [1, 0] + [np.nan] * 10)
-    np.testing.assert_array_equal(in_lanes.episode_ends[5], [3, 5] + [0] * 10)
+def test_lanes_equal_single_trainings(trainers):
+    train, num_parallel = trainers["plateau"], scripted_lanes()
+    assert_lanes_are_single_trainings(train, num_parallel, jax.jit(jax.vmap(train))(*num_parallel))
 
 
 def test_nested_lanes_equal_single_trainings(trainers):
@@ -492,53 +416,16 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
     assert seen == {"tests": 12 + 12, "phases": 1}  # the lane that waits is at a step 13
 
 
-@pytest.fixture(scope="module")
-def ddqn_in_se():
-    """Single and vmapped short trainings of a DDQN agent in SEs of different step limits."""
-    task = envs.make("cartpole")
-    env = registry.make("proxy", paper_se(hidden_size=4), task)
-    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
-    train = make_trainer(
-        make_ddqn(config, 4, 2), env, training(max_episodes=8, plateau_tolerance=0.3)
+def test_a_time_limit_is_never_terminal_in_an_se():
+    """As programs; what they do on a real task is above."""
+    env = paper_se(hidden_size=4).make(envs.make("cartpole"))
+    agent = make_ddqn(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4), 4, 2)
+    trainings = [training(stop_rule="never", time_limit_is_terminal=x) for x in (False, True)]
+    without, asked = (
+        re.sub("0x[0-9a-f]+", "", str(jax.make_jaxpr(train)(KEY, env.default_params)))
+        for train in (make_trainer(agent, env, config) for config in trainings)
     )
-    keys = jax.random.split(jax.random.key(1), 4)
-    each = [
-        env.params(env.init_weights(key)).replace(max_steps_in_episode=jnp.int32(limit))
-        for key, limit in zip(keys, [7, 15, 4, 11], strict=True)
-    ]
-    params = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    single = jax.jit(train)
-    return train, keys, params, [single(k, p) for k, p in zip(keys, each, strict=True)]
-
-
-def test_lanes_equal_single_trainings(ddqn_in_se):
-    train, keys, params, alone = ddqn_in_se
-    many = jax.jit(jax.vmap(train))(keys, params)
-    assert len({int(x.train_steps) for x in alone}) > 2  # lanes that stop at different times
-    for i in range(4):
-        assert_same(many, i, alone[i])
-
-
-@pytest.mark.parametrize("world", ["real", "synthetic"])
-def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
-    """As programs; what they then do is above."""
-    task = envs.make("cartpole")
-    synthetic = registry.make("proxy", paper_se(hidden_size=4), task)
-    env, params = {
-        "real": (task.env, task.params),
-        "synthetic": (synthetic, synthetic.default_params),
-    }[world]
-    agent = make_ddqn(
-        DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1), 4, 2
-    )
-    programs = [
-        str(jax.make_jaxpr(make_trainer(
-            agent, env, training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked)
-        ))(KEY, params))
-        for asked in (False, True)
-    ]  # fmt: skip
-    without, asked = (re.sub("0x[0-9a-f]+", "", program) for program in programs)
-    assert (without == asked) == (world == "synthetic")
+    assert without == asked
 
 
 # --- the test on the real task -------------------------------------------------------------------
@@ -565,20 +452,6 @@ def test_the_tester_equals_greedy_episodes_in_gymnasium():
             ended = terminated or num_steps == 200
         assert (returns[i], steps[i]) == (total, num_steps)
     assert len(set(np.asarray(steps).tolist())) > 1  # different initial states
-
-
-def test_test_episodes_end_at_the_step_limit_and_inactive_ones_do_not_begin():
-    params = script([2.5] * 12, [99] * 12)
-    task = envs.Task(name="script", env=ENV, params=params, solved_reward=0.0)
-    agent = scripted_agent()
-    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
-    test = jax.jit(make_tester(agent, task, num_episodes=3))
-    returns, steps, _ = test(KEY, state)
-    np.testing.assert_array_equal(returns, [2.5] * 3)
-    np.testing.assert_array_equal(steps, [MAX_STEPS] * 3)
-    returns, steps, _ = test(KEY, state, jnp.bool_(False))
-    np.testing.assert_array_equal(returns, 0.0)
-    np.testing.assert_array_equal(steps, 0)
 
 
 # --- steps that are kept for whoever looks -------------------------------------------------------
@@ -630,35 +503,40 @@ def test_a_recorded_training_is_the_training(recorded, trainers):
         assert_same(jax.tree.map(lambda x: x[None], with_record), 0, alone)
 
 
+def scripted_task(length):
+    """A task that pays 2.5 at the end of each episode, which terminates after so many steps."""
+    return envs.Task(name="script", env=ENV, params=script([2.5] * 12, [length] * 12))
+
+
+def scripted_state():
+    agent = scripted_agent()
+    return agent.begin_episode(agent.init(KEY, 0.0), 0)
+
+
 def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
     # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in the last one.
-    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
-    agent = scripted_agent()
-    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
-    test = jax.jit(make_tester(agent, task, 2))
+    test = jax.jit(make_tester(scripted_agent(), scripted_task(99), 2))
     for eval_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
-        tests = test(KEY, state, True, jnp.int32(eval_steps))
+        tests = test(KEY, scripted_state(), True, jnp.int32(eval_steps))
         np.testing.assert_array_equal(tests.scored, [scored] * 2)
         np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
         np.testing.assert_array_equal(tests.num_steps, [played] * 2)
+    tests = test(KEY, scripted_state(), False, jnp.int32(4))
+    assert not tests.returns.any() and not tests.num_steps.any()  # do not begin
 
 
 def test_actions_are_repeated_beyond_the_tasks_limit_too():
     # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
-    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
     agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
-    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
-    tests = make_tester(agent, task, 1)(KEY, state, True, jnp.int32(9))
+    tests = make_tester(agent, scripted_task(99), 1)(KEY, scripted_state(), True, jnp.int32(9))
     assert tests.num_steps == 9 and tests.returns == 2.5
 
 
 def test_recorded_tests_are_the_tests():
-    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [3] * 12))
-    agent = scripted_agent()
-    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    task, agent = scripted_task(3), scripted_agent()
     both = make_tester(agent, task, 3), make_recorder(agent, task, 3)
     (returns, num_steps, scored), steps = jax.jit(lambda *args: [f(*args) for f in both])(
-        KEY, state
+        KEY, scripted_state()
     )
     valid = np.array(steps.valid).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal(valid, [[True] * 3 + [False]] * 3)
@@ -689,20 +567,16 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     assert make_trainer(agent, task.env, asked)  # whose params may allow any length
 
 
-@pytest.mark.parametrize("swapped, field", [
-    (lambda agent, task: (task.env, agent), "agent"),
-    (lambda agent, task: (agent, (task.env, task.params)), "env"),
-    (lambda agent, task: (agent, task.env, {"max_steps": 3}), "training"),
+@pytest.mark.parametrize("make, field", [
+    (lambda agent, task: make_trainer(task.env, agent), "agent"),
+    (lambda agent, task: make_trainer(agent, (task.env, task.params)), "env"),
+    (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
+    (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, paper_training()),
+     "task"),
+    (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),
 ])  # fmt: skip
-def test_arguments_of_other_kinds_are_refused(swapped, field):
+def test_arguments_of_other_kinds_are_refused(make, field):
     task = envs.make("gridworld_2x2")
-    agent = registry.make("agent", QLearningConfig(), task)
     with pytest.raises(ConfigError) as error:
-        make_trainer(*swapped(agent, task))
+        make(registry.make("agent", QLearningConfig(), task), task)
     assert error.value.field == field
-    with pytest.raises(ConfigError) as error:
-        evaluation.make_evaluator(agent, task.env, task.env, paper_training())
-    assert error.value.field == "task"
-    with jax.enable_x64(True), pytest.raises(ConfigError) as error:
-        make_trainer(agent, task.env)
-    assert error.value.field == "jax_enable_x64"

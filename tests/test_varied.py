@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import paper_se, paper_training
+from support import paper_se, paper_training, random_columns
 
 import sejax
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, AgentConfig, Draw, Varied, drawing_key
+from sejax.agents.base import Agent, Draw, Varied, drawing_key
 from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.exploration import CountBasedConfig
@@ -22,7 +22,6 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.ops.networks import MLP, narrow
-from sejax.options import ConfigError
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
@@ -109,13 +108,8 @@ def embed(small, large):
 
 def random_batch(num_columns, seed):
     rng = np.random.default_rng(seed)
-    return Transition(
-        obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
-        action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)),
-        reward=np.float32(rng.normal(size=num_columns)),
-        discount=np.float32(rng.uniform(0, 1, num_columns)),
-        next_obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
-    )
+    columns = random_columns(rng, OBS_DIM, num_columns)
+    return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)), **columns)
 
 
 @pytest.mark.parametrize("kind", ["ddqn", "dueling"])
@@ -269,16 +263,6 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
-@dataclasses.dataclass(frozen=True)
-class ForeignConfig(AgentConfig):
-    """Of an agent that knows nothing of sejax's options."""
-
-    learning_rate: float = 0.5
-
-    def make(self, task):
-        return agent_that("is foreign")
-
-
 class Numbers(NamedTuple):
     rate: float
 
@@ -289,14 +273,6 @@ def agent_that(name, **fields):
         init=lambda key, hparams: name, act=None, update=None, buffer=no_buffer(),
         hparams=Numbers(rate=1.0), **fields,
     )  # fmt: skip
-
-
-def test_an_agent_none_of_whose_options_is_varied_is_refused():
-    task = envs.make("gridworld_2x2")
-    assert isinstance(make_agent(ForeignConfig(), task), Agent)
-    with pytest.raises(ConfigError) as error:
-        make_agent(ForeignConfig(), task, varied=True)
-    assert error.value.field == "agent_hparams"
 
 
 # --- whole programs ------------------------------------------------------------------------------

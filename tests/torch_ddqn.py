@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import torch
 from jax.flatten_util import ravel_pytree
-from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
-from torch_td3 import TorchMLP
+from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, nested_params, random_batch
+from torch_networks import TorchMLP, follow
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import make_ddqn
@@ -27,7 +27,7 @@ class TorchDDQN:
         self.num_updates = 0
 
     def network(self, params):
-        return TorchMLP(params, self.config)
+        return TorchMLP(params, self.config.activation)
 
     def update(self, batch):
         tensors = Transition(*(torch.tensor(np.array(x)) for x in batch))
@@ -49,13 +49,8 @@ class TorchDDQN:
         loss.backward()
         self.optimizer.step()
         self.num_updates += 1
-        if self.num_updates % self.config.target_update_every:
-            return
-        tau = self.config.tau
-        with torch.no_grad():
-            pairs = zip(self.target.parameters(), self.online.parameters(), strict=True)
-            for slow, fast in pairs:
-                slow.copy_(tau * fast + (1 - tau) * slow)
+        if self.num_updates % self.config.target_update_every == 0:
+            follow(self.target, self.online, self.config.tau)
 
 
 def golden(case, config, nested, make_reference=TorchDDQN):
@@ -77,7 +72,7 @@ def golden(case, config, nested, make_reference=TorchDDQN):
 def main():
     arrays = {}
     for case, config in CASES.items():
-        arrays |= golden(case, config, q_network(config)[1])
+        arrays |= golden(case, config, nested_params(config))
     np.savez(GOLDEN, **arrays)
 
 

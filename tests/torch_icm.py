@@ -6,8 +6,10 @@ Remake them with `python tests/torch_icm.py` where torch is installed.
 import jax
 import numpy as np
 import torch
+from support import raveled
 from test_icm import CONFIG, GOLDEN, KINDS, WIDTH, curious, model_of, random_batch
 from torch.nn import functional
+from torch_networks import TorchMLP, dense_arrays, linear
 
 NUM_UPDATES = 5
 
@@ -18,29 +20,12 @@ class TorchICM(torch.nn.Module):
     def __init__(self, params):
         super().__init__()
         forward = params["forward"]
-        blocks = [
-            self._linear(forward[f"Dense_{i}"]) for i in range(2 * CONFIG.num_residual_blocks)
-        ]
-        self.features = self._mlp(params["features"], torch.nn.LeakyReLU)
-        self.inverse = self._mlp(params["inverse"], torch.nn.ReLU)
-        self.before = self._mlp(forward["MLP_0"], torch.nn.LeakyReLU)
+        blocks = [linear(forward[f"Dense_{i}"]) for i in range(2 * CONFIG.num_residual_blocks)]
+        self.features = TorchMLP(params["features"], "leaky_relu")
+        self.inverse = TorchMLP(params["inverse"], "relu")
+        self.before = TorchMLP(forward["MLP_0"], "leaky_relu")
         self.blocks = torch.nn.ModuleList(blocks)
-        self.after = self._mlp(forward["MLP_1"], torch.nn.LeakyReLU)
-
-    @staticmethod
-    def _linear(params):
-        layer = torch.nn.Linear(*params["kernel"].shape[::-1])
-        layer.weight.data = torch.tensor(np.array(params["kernel"]))
-        layer.bias.data = torch.tensor(np.array(params["bias"]))
-        return layer
-
-    @classmethod
-    def _mlp(cls, params, activation):
-        layers = []
-        for i in range(len(params)):
-            layers += [activation()] if layers else []
-            layers.append(cls._linear(params[f"Dense_{i}"]))
-        return torch.nn.Sequential(*layers)
+        self.after = TorchMLP(forward["MLP_1"], "leaky_relu")
 
     def forward(self, obs, action, next_obs):
         features, next_features = self.features(obs), self.features(next_obs)
@@ -53,19 +38,10 @@ class TorchICM(torch.nn.Module):
 
     def arrays(self):
         """The parameters as flax nests them."""
-
-        def leaf(m):
-            return {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
-
-        def named(layers):
-            linear = [m for m in layers if isinstance(m, torch.nn.Linear)]
-            return {f"Dense_{i}": leaf(m) for i, m in enumerate(linear)}
-
-        forward = {"MLP_0": named(self.before), "MLP_1": named(self.after), **named(self.blocks)}
-        params = {
-            "features": named(self.features), "inverse": named(self.inverse), "forward": forward
-        }  # fmt: skip
-        return {"params": params}
+        forward = {"MLP_0": self.before.nested(), "MLP_1": self.after.nested()}
+        forward |= dense_arrays(self.blocks)
+        nets = {"features": self.features.nested(), "inverse": self.inverse.nested()}
+        return {"params": nets | {"forward": forward}}
 
 
 def tensors(batch):
@@ -100,7 +76,7 @@ def train(model, optimizer, batch):
 def main():
     """Writes parameters and bonuses after one and five updates on the test's batches."""
     arrays = {}
-    _, _, unravel = model_of(CONFIG)
+    _, unravel = model_of(CONFIG)
     for kind in KINDS:
         agent = curious(kind)
         params = agent.init(jax.random.key(1), agent.hparams).params
@@ -110,8 +86,7 @@ def main():
         for number in range(1, NUM_UPDATES + 1):
             bonus = train(model, optimizer, random_batch(number, kind))
             if number in (1, NUM_UPDATES):
-                flat, _ = jax.flatten_util.ravel_pytree(model.arrays())
-                arrays[f"{kind}/params/{number}"] = flat
+                arrays[f"{kind}/params/{number}"] = raveled(model.arrays())
                 arrays[f"{kind}/bonus/{number}"] = bonus.numpy()
     np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
 

@@ -7,7 +7,7 @@ Remake it with `python tests/torch_ppo.py` where torch is installed.
 import jax
 import numpy as np
 import torch
-from jax.flatten_util import ravel_pytree
+from support import raveled
 from test_ppo import (
     CONFIG,
     CONFIGS,
@@ -16,11 +16,11 @@ from test_ppo import (
     KINDS,
     MAX_ACTION,
     STEPS,
-    loss_inputs,
     networks,
     ppo,
     random_steps,
 )
+from torch_networks import TorchMLP
 
 from sejax.agents.ppo import shuffled
 
@@ -46,7 +46,9 @@ class TorchPPO:
 
     def __init__(self, kind, params):
         self.kind, self.config = kind, CONFIGS[kind]
-        self.actor, self.critic = (self._network(params[name]) for name in ("actor", "critic"))
+        self.actor, self.critic = (
+            TorchMLP(params[name]["params"], "tanh") for name in ("actor", "critic")
+        )
         self.std = torch.nn.Parameter(torch.tensor(np.array(params["std"])))
         parameters = [*self.actor.parameters(), *self.critic.parameters(), self.std]
         self.parameters = parameters
@@ -54,15 +56,6 @@ class TorchPPO:
         self.optimizer = torch.optim.Adam(
             parameters, lr=CONFIG.learning_rate, eps=self.config.adam_eps
         )
-
-    def _network(self, params):
-        layers = []
-        for i in range(CONFIG.num_layers + 1):
-            kernel, bias = (np.array(params["params"][f"Dense_{i}"][x]) for x in ("kernel", "bias"))
-            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
-            layer.weight.data, layer.bias.data = torch.tensor(kernel), torch.tensor(bias)
-            layers += [layer, torch.nn.Tanh()]
-        return torch.nn.Sequential(*layers[:-1])
 
     def evaluate(self, obs, action):
         if self.kind != "continuous":
@@ -131,41 +124,13 @@ class TorchPPO:
         return normalized(torch.tensor(returns))
 
     def flat(self):
-        def arrays(network):
-            linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
-            return {
-                "params": {
-                    f"Dense_{i}": {
-                        "kernel": layer.weight.detach().numpy(),
-                        "bias": layer.bias.detach().numpy(),
-                    }
-                    for i, layer in enumerate(linear)
-                }
-            }
-
-        nested = {
-            "actor": arrays(self.actor),
-            "critic": arrays(self.critic),
-            "std": self.std.detach().numpy(),
-        }
-        return ravel_pytree(nested)[0]
-
-
-def loss_arrays():
-    """The loss of the test's inputs and its gradients."""
-    inputs = {name: torch.tensor(np.array(x)) for name, x in loss_inputs().items()}
-    wanted = ("log_prob", "entropy", "value")
-    for name in wanted:
-        inputs[name].requires_grad_()
-    loss = loss_fn(**inputs)
-    gradients = torch.autograd.grad(loss, [inputs[name] for name in wanted])
-    named = {f"loss/{name}": g.numpy() for name, g in zip(wanted, gradients, strict=True)}
-    return {"loss": loss.item()} | named
+        actor, critic = ({"params": x.nested()} for x in (self.actor, self.critic))
+        return raveled({"actor": actor, "critic": critic, "std": self.std.detach().numpy()})
 
 
 def main():
-    """Writes the loss, and the parameters before and after each learning phase."""
-    arrays = loss_arrays()
+    """Writes the parameters before and after each learning phase."""
+    arrays = {}
     for kind in KINDS:
         _, _, unravel = networks(kind)
         agent = ppo(kind)

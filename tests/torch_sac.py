@@ -8,6 +8,7 @@ own. Remake it with `python tests/torch_sac.py` where torch is installed.
 import jax
 import numpy as np
 import torch
+from support import raveled
 from test_sac import (
     ACTION_DIM,
     CASES,
@@ -21,7 +22,7 @@ from test_sac import (
 )
 from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-from torch_td3 import TorchMLP
+from torch_networks import TorchMLP, follow
 
 
 class TorchSAC:
@@ -29,15 +30,16 @@ class TorchSAC:
 
     def __init__(self, case):
         self.is_discrete, self.config = CASES[case]
+        activation = self.config.activation
         params, target_critics = nested(case, state_of(case))
 
         def pair(critics):
             return torch.nn.ModuleList(
-                TorchMLP(jax.tree.map(lambda x, i=i: x[i], critics["params"]), self.config)
+                TorchMLP(jax.tree.map(lambda x, i=i: x[i], critics["params"]), activation)
                 for i in range(2)
             )
 
-        self.actor = TorchMLP(params.actor["params"], self.config)
+        self.actor = TorchMLP(params.actor["params"], activation)
         self.critics, self.target_critics = pair(params.critics), pair(target_critics)
         self.log_alpha = torch.nn.Parameter(torch.tensor(float(params.log_alpha)))
         self.optimizers = [
@@ -108,25 +110,18 @@ class TorchSAC:
             for parameter, value in zip(group, gradient, strict=True):
                 parameter.grad = value
             optimizer.step()
-        tau = config.tau
-        pairs = zip(self.critics.parameters(), self.target_critics.parameters(), strict=True)
-        with torch.no_grad():
-            for fast, slow in pairs:
-                slow.copy_(tau * fast + (1 - tau) * slow)
+        follow(self.target_critics, self.critics, config.tau)
 
     def flat(self):
         """Parameters as the agent keeps them."""
-
-        def vector(tree):
-            return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
 
         def stacked(critics):
             return jax.tree.map(lambda *x: np.stack(x), *(critic.nested() for critic in critics))
 
         log_alpha = self.log_alpha.detach().numpy()
         return {
-            "params": vector([self.actor.nested(), stacked(self.critics), log_alpha]),
-            "target_critics": vector(stacked(self.target_critics)),
+            "params": raveled([self.actor.nested(), stacked(self.critics), log_alpha]),
+            "target_critics": raveled(stacked(self.target_critics)),
         }
 
 

@@ -4,8 +4,11 @@ torch is large and not needed for the tests, so that what it computed is kept in
 Remake it with `python tests/torch_td3.py` where torch is installed.
 """
 
+import functools
+
 import numpy as np
 import torch
+from support import raveled
 from test_td3 import (
     CASES,
     CHECKED_UPDATES,
@@ -17,54 +20,9 @@ from test_td3 import (
     initial_params,
     nested_params,
 )
+from torch_networks import TorchMLP, follow
 
 from sejax.agents.td3 import DiscreteTD3Config
-
-
-class TorchMLP(torch.nn.Module):
-    """The authors' layout: hidden layers that share an activation and a layer norm, and a head."""
-
-    def __init__(self, params, config):
-        super().__init__()
-        self.layers = torch.nn.ModuleList()
-        for i in range(config.num_layers + 1):
-            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
-            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
-            layer.weight.data = torch.tensor(np.array(kernel))
-            layer.bias.data = torch.tensor(np.array(bias))
-            self.layers.append(layer)
-        self.activate = {
-            "tanh": torch.nn.Tanh, "relu": torch.nn.ReLU,
-            "leaky_relu": torch.nn.LeakyReLU, "prelu": torch.nn.PReLU,
-        }[config.activation]()  # fmt: skip
-        if config.activation == "prelu":
-            self.activate.weight.data = torch.tensor([float(params["prelu_slope"])])
-        self.norm = None
-        if "LayerNorm_0" in params:
-            self.norm = torch.nn.LayerNorm(config.hidden_size)
-            self.norm.weight.data = torch.tensor(np.array(params["LayerNorm_0"]["scale"]))
-            self.norm.bias.data = torch.tensor(np.array(params["LayerNorm_0"]["bias"]))
-
-    def forward(self, x):
-        for i, layer in enumerate(self.layers[:-1]):
-            x = layer(x)
-            if self.norm is not None and i > 0:
-                x = self.norm(x)
-            x = self.activate(x)
-        return self.layers[-1](x)
-
-    def nested(self):
-        out = {
-            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
-            for i, m in enumerate(self.layers)
-        }
-        if self.norm is not None:
-            scale, bias = self.norm.weight.detach().numpy(), self.norm.bias.detach().numpy()
-            out["LayerNorm_0"] = {"scale": scale, "bias": bias}
-            out["width"] = np.float32(len(scale))
-        if isinstance(self.activate, torch.nn.PReLU):
-            out["prelu_slope"] = self.activate.weight.detach().numpy()[0]
-        return out
 
 
 class TorchTD3:
@@ -74,9 +32,11 @@ class TorchTD3:
         self.config = config
         self.is_discrete = isinstance(config, DiscreteTD3Config)
         actor, critics, target_actor, target_critics = nested_params(config, params)
-        self.actor, self.target_actor = TorchMLP(actor, config), TorchMLP(target_actor, config)
-        self.critics = [TorchMLP(x, config) for x in critics]
-        self.target_critics = [TorchMLP(x, config) for x in target_critics]
+        network = functools.partial(TorchMLP, activation=config.activation)
+        self.actor, self.target_actor = network(actor), network(target_actor)
+        self.critics, self.target_critics = (
+            list(map(network, x)) for x in (critics, target_critics)
+        )
         rate = config.learning_rate
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=rate)
         self.critic_optimizer = torch.optim.Adam(
@@ -138,29 +98,17 @@ class TorchTD3:
             self.actor_optimizer.zero_grad()
             (-q_value(self.critics[0], obs, chosen)[counted].mean()).backward()
             self.actor_optimizer.step()
-            self.move_targets()
-
-    @torch.no_grad()
-    def move_targets(self):
-        tau = self.config.tau
-        networks = [self.actor, *self.critics]
-        targets = [self.target_actor, *self.target_critics]
-        for network, target in zip(networks, targets, strict=True):
-            for fast, slow in zip(network.parameters(), target.parameters(), strict=True):
-                slow.copy_(tau * fast + (1 - tau) * slow)
+            targets = self.target_actor, *self.target_critics
+            for slow, fast in zip(targets, (self.actor, *self.critics), strict=True):
+                follow(slow, fast, config.tau)
 
     def flat(self):
         """Parameters as the agent keeps them."""
-        from jax.flatten_util import ravel_pytree
-
-        def rows(networks):
-            return np.stack([ravel_pytree(x.nested())[0] for x in networks])
-
         return {
-            "actor": rows([self.actor])[0],
-            "critics": rows(self.critics),
-            "target_actor": rows([self.target_actor])[0],
-            "target_critics": rows(self.target_critics),
+            "actor": raveled(self.actor.nested()),
+            "critics": np.stack([raveled(x.nested()) for x in self.critics]),
+            "target_actor": raveled(self.target_actor.nested()),
+            "target_critics": np.stack([raveled(x.nested()) for x in self.target_critics]),
         }
 
 
