@@ -6,7 +6,10 @@ import re
 
 import jax
 import numpy as np
+import pytest
 from PIL import Image
+
+from sejax.options import ConfigError
 
 
 def shapes_of(fn, *args):
@@ -142,3 +145,16 @@ def is_drawn(path):
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     inked = pixels[(pixels != 255).any(axis=1)]
     return len(inked) > len(pixels) / 100 and len(np.unique(inked, axis=0)) > 10
+
+
+def refusal(call, *args, **kwargs):
+    """The error of a call that is refused: one short message that names a field."""
+    with pytest.raises(ConfigError) as caught:
+        call(*args, **kwargs)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) <= 300
+    return caught.value
+
+
+def refused(call, *args, **kwargs):
+    """The field that a refused call names."""
+    return refusal(call, *args, **kwargs).field
