@@ -2,7 +2,9 @@
 
 import functools
 import math
+import os
 import re
+import shutil
 
 import jax
 import numpy as np
@@ -145,6 +147,11 @@ def is_drawn(path):
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     inked = pixels[(pixels != 255).any(axis=1)]
     return len(inked) > len(pixels) / 100 and len(np.unique(inked, axis=0)) > 10
+
+
+def has_compiler():
+    """Whether MuJoCo's library can be built here."""
+    return any(map(shutil.which, (os.environ.get("CXX") or "c++", "c++", "g++", "clang++")))
 
 
 def refusal(call, *args, **kwargs):

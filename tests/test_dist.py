@@ -150,13 +150,6 @@ for tuner in sejax.pretrained_tuners():
     assert lines == {each.name: "True" for each in shipped}
 
 
-def test_what_needs_an_extra_says_which(run):
-    said = run("-c", "import sejax\n"
-               "try: sejax.load('hf://me/se')\n"
-               "except sejax.ConfigError as error: print(error)")  # fmt: skip
-    assert said.endswith("Install it with pip install 'sejax[hub]'.\n")
-
-
 def test_the_commands_run(run):
     tiny = ["env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "generations=1",
             "es.num_incumbent_evals=1", "training.max_steps=30", "devices=1",

@@ -20,7 +20,7 @@ from sejax import envs
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.networks import shapes_of as shapes_of_networks
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import find, pretrained_names

@@ -21,7 +21,7 @@ import sejax
 from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
 from sejax.gym import GridWorld, RewardNetwork, make, networks
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 from sejax.proxies import header
 from sejax.proxies.configs import VARIANTS, RewardConfig
 from sejax.proxies.reward import RewardState
@@ -179,7 +179,8 @@ def test_rewards_are_those_of_the_rn_in_jax(name):
     obs, _ = env.reset(seed=0)
     rows = []
     for _ in range(5000):
-        before, (obs, reward, terminated, truncated, info) = obs, env.step(env.action_space.sample())
+        before, action = obs, env.action_space.sample()
+        obs, reward, terminated, truncated, info = env.step(action)
         rows.append((before, obs, terminated, info["real_reward"], reward))
         if terminated or truncated:
             obs, _ = env.reset()

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from support import refusal
 
 import sejax
 from sejax import envs
@@ -57,15 +58,6 @@ def rewrite(path, change):
     path.write_bytes(pack(*change(tensors, values)))
 
 
-def refusal(load, *args, **kwargs):
-    """The error that a call raises: one short message that names a field."""
-    with pytest.raises(ConfigError) as caught:
-        load(*args, **kwargs)
-    message = str(caught.value)
-    assert "\n" not in message and len(message) <= 300
-    return caught.value
-
-
 # --- round trips ---------------------------------------------------------------------------------
 
 
@@ -104,16 +96,6 @@ def test_no_path_of_the_machine_is_kept(path, env, weights):
     assert config["objective"] == {"name": "ranking", "landscape": None, "steps": 7}
 
 
-def test_a_loaded_proxy_steps_as_a_gymnax_environment():
-    env, params = sejax.load("cartpole")
-    obs, state = env.reset(jax.random.key(0), params)
-    key, action = jax.random.key(1), jnp.int32(1)
-    obs, _, reward, terminated, *_ = env.step(key, state, action, params)
-    assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
-    without = env.step(key, state, action)[2]  # as wrappers call it
-    assert jnp.isclose(without, reward, rtol=1e-5)  # another program, which may round otherwise
-
-
 @pytest.fixture(scope="module")
 def a_set(tmp_path_factory, env, weights):
     """A file of three proxies."""
@@ -145,21 +127,6 @@ def test_parts_of_a_set_are_chosen_by_score_and_place(a_set, weights):
     chosen = proxies[[2, 0]]
     assert_same_weights(chosen[0].params.weights, weights[2])
     assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
-
-
-def test_all_proxies_of_a_set_step_at_once(a_set):
-    proxies = sejax.load_set(a_set)
-    env, key = proxies.env, jax.random.key(0)
-
-    @jax.jit
-    def reward(weights):
-        params = env.params(weights, proxies.discount)
-        _, state = env.reset_env(key, params)
-        return env.step_env(key, state, jnp.int32(0), params)[2]
-
-    rewards = jax.vmap(reward)(proxies.weights)
-    np.testing.assert_allclose(rewards, [reward(x.params.weights) for x in proxies], rtol=1e-6)
-    assert len(set(rewards.tolist())) == 3
 
 
 def test_registering_with_gymnax_is_idempotent():

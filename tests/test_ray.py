@@ -301,19 +301,6 @@ def test_a_run_goes_on_with_or_without_the_cluster(cluster, wanted, tmp_path):
     assert results(tmp_path) == wanted
 
 
-def test_a_stopped_worker_is_ended_and_another_started(cluster, tmp_path):
-    words = "machines=ray", "generations=1000"
-    with Driver(tmp_path, *words, environment=cluster.environment) as driver:
-        wait_for(lambda: len(cluster.workers()) == 2 and driver.generations() > 2)
-        there = set(cluster.workers())
-        stopped = min(there)
-        started = time.monotonic()
-        os.kill(stopped, signal.SIGSTOP)
-        wait_for(lambda: not is_there(stopped), 300)
-        print(f"gone after {time.monotonic() - started:.1f} s")
-        wait_for(lambda: set(cluster.workers()) - there)
-
-
 def test_a_run_whose_own_cluster_dies_ends_with_one_message(folder, tmp_path):
     environment = ENVIRONMENT | {"RAY_TMPDIR": str(folder)}
     words = "machines=ray", "machines.address=local", "machines.workers=1", "generations=1000"

@@ -127,13 +127,6 @@ def test_a_run_has_these_files(whole):
     assert yaml.safe_load((whole / "config.yaml").read_text()) == CONFIG | {"generations": 5}
 
 
-@pytest.mark.parametrize("block", [1, 2, 5])
-def test_a_run_in_two_sessions_equals_one_in_one(whole, tmp_path, block):
-    go(tmp_path, 3, block)
-    assert go(tmp_path, 5, block) == 3
-    assert results(tmp_path) == results(whole)
-
-
 def test_a_finished_run_is_left_as_it_is(run):
     written = [path for path in run.iterdir() if path.name != "sejax.lock"]
     before = [path.stat().st_mtime_ns for path in written]

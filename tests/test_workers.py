@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import refusal, refused
 
 import sejax
 from sejax.bilevel import make_bilevel
@@ -19,7 +20,7 @@ from sejax.cli import cluster, runtime, session, workers
 from sejax.cli import config as configuration
 from sejax.cli.cluster import Pool
 from sejax.cli.workers import Batch, RemoteChunks, cut
-from sejax.options import ConfigError, FailedError
+from sejax.options import FailedError
 
 FOREVER = 1e9
 
@@ -260,9 +261,8 @@ def test_so_they_do_with_the_flags_of_a_command(case):
 def test_a_worker_with_other_versions_is_refused():
     config = sejax.config(TINY)
     expected = runtime.versions() | {"jax": "0.1"}
-    with pytest.raises(ConfigError, match=r"0\.1") as error:
-        workers.Worker(configuration.plain(config), [5], 0.0, expected)
-    assert error.value.field == "machines"
+    error = refusal(workers.Worker, configuration.plain(config), [5], 0.0, expected)
+    assert error.field == "machines" and "0.1" in str(error)
 
 
 # --- the command ---------------------------------------------------------------------------------
@@ -270,8 +270,7 @@ def test_a_worker_with_other_versions_is_refused():
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'sejax\[ray\]'"):
-        sejax.config(["machines=ray"])
+    assert "pip install 'sejax[ray]'" in str(refusal(sejax.config, ["machines=ray"]))
 
 
 @pytest.mark.parametrize(
@@ -284,20 +283,4 @@ def test_without_ray_the_extra_is_named(monkeypatch):
 )
 def test_settings_that_no_worker_can_have_are_refused(words, field, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: "there")
-    with pytest.raises(ConfigError) as error:
-        sejax.config(["machines=ray", *words])
-    assert error.value.field == field
-
-
-def test_a_run_by_workers_has_the_files_of_one_process(tmp_path):
-    from sejax.cli.run_directory import open_for
-
-    found = []
-    for name in ("local", "remote"):
-        config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path / name}"])
-        remote = remote_chunks(config, Ray())
-        chunks = session.Chunks(remote.learner) if name == "local" else remote
-        with open_for(config) as directory:
-            session.run(config, directory, chunks)
-            found.append([row | {"wall_s": ""} for row in directory.rows])
-    assert found[0] == found[1]
+    assert refused(sejax.config, ["machines=ray", *words]) == field
