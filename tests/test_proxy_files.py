@@ -5,7 +5,6 @@ import dataclasses
 import errno
 import functools
 import math
-import sys
 
 import chex
 import jax
@@ -338,55 +337,6 @@ def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights,
     assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
     rewrite(path, lambda tensors, values: (tensors, "sejax", values | {"task": text}))
     assert text in str(refusal(sejax.load, path))
-
-
-MINE = """
-import dataclasses
-from sejax import envs
-from sejax.proxies.configs import RewardConfig
-
-@dataclasses.dataclass(frozen=True)
-class Room:
-    size: int = 2
-
-    def make(self):
-        return dataclasses.replace(envs.make("gridworld_2x2"), name="my_room", origin=None)
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Mine(RewardConfig):
-    mine: int = 3
-"""
-
-
-@pytest.fixture
-def mine(tmp_path, monkeypatch):
-    """A file of a foreign kind of proxy of a foreign task, whose module is not imported any more.
-
-    Returns the file, the task and the proxy's configuration.
-    """
-    (tmp_path / "my_file_worlds.py").write_text(MINE)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    task = envs.make("my_file_worlds:Room", size=3)
-    config = registry.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
-    env = registry.make("proxy", config, task)
-    path = tmp_path / "mine.safetensors"
-    sejax.save(path, env, env.init_weights(jax.random.key(0)), discount=0.7)
-    del sys.modules["my_file_worlds"]
-    return path, task, config
-
-
-def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine):
-    path, task, config = mine
-    stored = header.read_config(path)
-    assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
-    assert stored["proxy"]["name"] == "my_file_worlds:Mine"
-    before = set(sys.modules)
-    for given, field in (({}, "proxy"), ({"task": task}, "proxy"), ({"proxy": config}, "task")):
-        assert refusal(sejax.load, path, **given).field == field
-    assert set(sys.modules) == before
-    env, _ = sejax.load(path, task=task, proxy=config)
-    assert env.task is task and env.config == config
-    assert "my_file_worlds" not in sys.modules
 
 
 def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
