@@ -39,6 +39,16 @@ def unraveled(vector, like):
     )
 
 
+def bits(tree):
+    """The leaves of a pytree as bytes, with their dtypes and shapes; keys as their data."""
+    found = []
+    for leaf in jax.tree.leaves(tree):
+        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+        found.append(f"{leaf.dtype}{array.shape}".encode() + array.tobytes())
+    return found
+
+
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
     """The MLP on a single input `[in]`, by plain loops over units."""
     activate = {

@@ -90,30 +90,33 @@ def end(process):
     process.wait()
 
 
+def started(folder, environment, *command):
+    """A process in a session of its own, and the file with what it says."""
+    log = folder / f"{time.monotonic_ns()}.log"
+    with log.open("w") as said:
+        process = subprocess.Popen(
+            command,
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+    return process, log
+
+
 class Node:
     """A node of one CPU; its processes are those of a session."""
 
     def __init__(self, folder, *words):
-        self.log = folder / f"{time.monotonic_ns()}.log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "ray.scripts.scripts",
-                    "start",
-                    "--block",
-                    "--num-cpus=1",
-                    "--node-ip-address=127.0.0.1",
-                    "--object-store-memory=100000000",
-                    *words,
-                ],
-                start_new_session=True,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=ENVIRONMENT,
-            )
+        self.process, self.log = started(
+            folder,
+            ENVIRONMENT,
+            *(sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--num-cpus=1"),
+            "--node-ip-address=127.0.0.1",
+            "--object-store-memory=100000000",
+            *words,
+        )
         wait_for(lambda: "Ray runtime started" in self.log.read_text())
 
     def workers(self):
@@ -178,16 +181,8 @@ class Driver:
     def __init__(self, folder, *words, environment=ENVIRONMENT):
         self.folder = folder
         folder.mkdir(exist_ok=True)
-        self.log = folder / f"{time.monotonic_ns()}.log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [*RUN, f"run_dir={folder / 'run'}", *words],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
+        command = *RUN, f"run_dir={folder / 'run'}", *words
+        self.process, self.log = started(folder, environment, *command)
 
     def __enter__(self):
         return self
