@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shutil
+import subprocess
 
 import jax
 import numpy as np
@@ -157,6 +158,13 @@ def is_drawn(path):
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     inked = pixels[(pixels != 255).any(axis=1)]
     return len(inked) > len(pixels) / 100 and len(np.unique(inked, axis=0)) > 10
+
+
+def printed(*command, **options):
+    """What a command prints, which must end well."""
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def has_compiler():

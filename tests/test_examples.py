@@ -3,7 +3,6 @@
 import importlib
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import random_like, raveled, refused, shapes_of
+from support import printed, random_like, raveled, refused, shapes_of
 
 import sejax
 from sejax.agents import sac
@@ -97,9 +96,7 @@ def test_a_command_takes_parts_from_its_folder_and_a_file_imports_none(examples,
                "objective=own_objective:RiskAverse", "objective.aversion=2"]  # fmt: skip
     small = ["generations=1", "es.population_size=2", "es.num_incumbent_evals=1", "devices=1",
              "training.max_steps=30", "run_dir=here"]  # fmt: skip
-    command = [sys.executable, "-m", "sejax.run", *choices, *small]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    printed(sys.executable, "-m", "sejax.run", *choices, *small, cwd=tmp_path)
     here, before = tmp_path / "here", set(sys.modules)
     assert header.read_config(here)["env"] == {"name": "own_task:make_reacher", "size": 4}
     assert refused(sejax.load, here) == "proxy"

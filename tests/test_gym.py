@@ -2,7 +2,6 @@
 
 import dataclasses
 import pickle
-import subprocess
 import sys
 
 import gymnasium
@@ -13,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TransformObservation
-from support import random_like, refused, shapes_of
+from support import printed, random_like, refused, shapes_of
 
 import sejax
 from sejax import envs
@@ -366,8 +365,7 @@ loaded = {"jax", "flax", "jaxtyping", "stable_baselines3", "torch"} & set(sys.mo
 print(envs.step([0, 1])[0].shape, sorted(loaded))
 envs.close()
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.strip() == "(2, 4) []", done.stdout + done.stderr
+    assert printed(sys.executable, "-c", program) == "(2, 4) []\n"
 
 
 # --- tasks ---------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import pytest
 from safetensors.numpy import load_file
+from support import printed
 
 pytestmark = [
     pytest.mark.slow,
@@ -311,19 +312,14 @@ def test_a_run_whose_own_cluster_dies_ends_with_one_message(folder, tmp_path):
 
 
 def test_a_search_has_its_trials_made_by_workers(cluster, tmp_path):
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "sejax.search", "env=gridworld_2x2", "agent=q_learning"),
-            *("es.noise_std=interval(0.1, 1)", "es.population_size=2", "trials=4", "verify=0"),
-            *("max_generations=3", "min_generations=1", "machines=ray", "search_dir=search"),
-        ],
+    printed(
+        *(sys.executable, "-m", "sejax.search", "env=gridworld_2x2", "agent=q_learning"),
+        *("es.noise_std=interval(0.1, 1)", "es.population_size=2", "trials=4", "verify=0"),
+        *("max_generations=3", "min_generations=1", "machines=ray", "search_dir=search"),
         cwd=tmp_path,
         env=cluster.environment,
-        capture_output=True,
-        text=True,
         timeout=300,
     )
-    assert done.returncode == 0, done.stderr
     rows = (tmp_path / "search" / "trials.csv").read_text().splitlines()
     assert len(rows) - 1 >= 4
 

@@ -3,7 +3,6 @@
 import itertools
 import os
 import random
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import bits, refusal, refused
+from support import bits, printed, refusal, refused
 
 import sejax
 from sejax.bilevel import make_bilevel
@@ -240,14 +239,8 @@ def test_so_they_do_with_the_flags_of_a_command(case):
         "test_workers.require_equal_numbers(sys.argv[1:], 3)"
     )
     environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run(
-        [sys.executable, "-c", program, *CASES[case]],
-        env=environment,
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    folder = Path(__file__).parent
+    printed(sys.executable, "-c", program, *CASES[case], env=environment, cwd=folder)
 
 
 def test_a_worker_with_other_versions_is_refused():
