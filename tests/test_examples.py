@@ -149,7 +149,8 @@ def test_a_sac_update_is_sejaxs(examples):
     noise = np.float32(rng.normal(size=(2, BATCH, ACTION_DIM)))
     after = jax.jit(lambda *args: own_agent.learn(networks, *args))(state, batch, noise)
 
-    config = sejax.SACConfig(**options, num_layers=2, activation="relu", learning_rate=1e-3)
+    config = sejax.SACConfig(**options, num_layers=2, activation="relu", learning_rate=1e-3,
+                             alpha=None, target_entropy=-1.0)  # fmt: skip
     policy = sac.gaussian_policy(ACTION_DIM, 1.0)
     agent = sac.make_sac(config, OBS_DIM, policy)
     learn = sac.make_learning_step(sac.make_networks(config, OBS_DIM, policy), policy)
