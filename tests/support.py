@@ -2,12 +2,17 @@
 
 import functools
 import math
+import os
 import re
+import shutil
+import subprocess
 
 import jax
 import numpy as np
+import pytest
 from PIL import Image
 
+from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -58,6 +63,16 @@ def assert_equal(a, b):
     """The numbers of two pytrees are the same."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+def bits(tree):
+    """The leaves of a pytree as bytes, with their dtypes and shapes; keys as their data."""
+    found = []
+    for leaf in jax.tree.leaves(tree):
+        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+        found.append(f"{leaf.dtype}{array.shape}".encode() + array.tobytes())
+    return found
 
 
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
@@ -179,3 +194,28 @@ def is_drawn(path):
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     inked = pixels[(pixels != 255).any(axis=1)]
     return len(inked) > len(pixels) / 100 and len(np.unique(inked, axis=0)) > 10
+
+
+def printed(*command, **options):
+    """What a command prints, which must end well."""
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def has_compiler():
+    """Whether MuJoCo's library can be built here."""
+    return any(map(shutil.which, (os.environ.get("CXX") or "c++", "c++", "g++", "clang++")))
+
+
+def refusal(call, *args, **kwargs):
+    """The error of a call that is refused: one short message that names a field."""
+    with pytest.raises(ConfigError) as caught:
+        call(*args, **kwargs)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) <= 300
+    return caught.value
+
+
+def refused(call, *args, **kwargs):
+    """The field that a refused call names."""
+    return refusal(call, *args, **kwargs).field

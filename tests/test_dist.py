@@ -15,6 +15,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from support import printed
 from test_examples import NEEDS, PRINTS, TINY
 
 import sejax
@@ -79,10 +80,7 @@ def run(python, tmp_path):
     def run(*words):
         environ = {name: x for name, x in os.environ.items()
                    if name not in ("PYTHONPATH", "XLA_FLAGS")}  # fmt: skip
-        done = subprocess.run([python, *words], cwd=tmp_path, env=environ, capture_output=True,
-                              text=True)  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        return printed(python, *words, cwd=tmp_path, env=environ)
 
     return run
 
@@ -93,8 +91,7 @@ def run(python, tmp_path):
 def of_git(folder):
     """Files of the repository in a folder, new ones too."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", folder]
-    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
-    return {name for name in done.stdout.splitlines() if (ROOT / name).exists()}
+    return {name for name in printed(*command, cwd=ROOT).splitlines() if (ROOT / name).exists()}
 
 
 def test_the_wheel_is_the_package_as_git_has_it(wheel):
@@ -147,13 +144,6 @@ for proxy in sejax.pretrained():
     assert lines == {proxy.name: "True" for proxy in sejax.pretrained()}
 
 
-def test_what_needs_an_extra_says_which(run):
-    said = run("-c", "import sejax\n"
-               "try: sejax.load('hf://me/se')\n"
-               "except sejax.ConfigError as error: print(error)")  # fmt: skip
-    assert said.endswith("Install it with pip install 'sejax[hub]'.\n")
-
-
 def test_the_commands_run(run):
     tiny = ["env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "generations=1",
             "es.num_incumbent_evals=1", "training.max_steps=30", "devices=1",
@@ -181,8 +171,7 @@ def test_a_users_script_runs_and_mypy_finds_nothing_in_it(run, python, tmp_path)
     assert run("script.py") == f"20 () True {count}\n"
     mypy = [sys.executable, "-m", "mypy", "--strict", "--python-executable", python,
             "--cache-dir", tmp_path / "cache", "script.py"]  # fmt: skip
-    done = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    printed(*mypy, cwd=tmp_path)
 
 
 # --- with the extra search -----------------------------------------------------------------------

@@ -3,7 +3,6 @@
 import importlib
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import paper_training, random_like, shapes_of
+from support import paper_training, printed, random_like, raveled, refused, shapes_of
 
 import sejax
+from sejax.agents import sac
+from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 TINY = {
@@ -86,7 +87,8 @@ def test_it_runs(name, examples, monkeypatch, capsys):
     assert re.search(PRINTS[name], capsys.readouterr().out)
 
 
-def test_a_command_takes_a_task_an_agent_a_proxy_and_an_objective_from_its_folder(tmp_path):
+def test_a_command_takes_parts_from_its_folder_and_a_file_imports_none(examples, tmp_path):
+    """What the command stores names them; it loads if task and proxy are given."""
     for name in ("own_task", "own_agent", "own_proxy", "own_objective"):
         shutil.copy(EXAMPLES / f"{name}.py", tmp_path)
     choices = ["env=own_task:make_reacher", "env.size=4", "agent=own_agent:SAC",
@@ -94,108 +96,76 @@ def test_a_command_takes_a_task_an_agent_a_proxy_and_an_objective_from_its_folde
                "objective=own_objective:RiskAverse", "objective.aversion=2"]  # fmt: skip
     small = ["generations=1", "es.population_size=2", "es.num_incumbent_evals=1", "devices=1",
              "training.max_steps=30", "run_dir=here"]  # fmt: skip
-    command = [sys.executable, "-m", "sejax.run", *choices, *small]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    with pytest.raises(sejax.ConfigError, match="what a file names is never imported"):
-        sejax.load(tmp_path / "here")
+    printed(sys.executable, "-m", "sejax.run", *choices, *small, cwd=tmp_path)
+    here, before = tmp_path / "here", set(sys.modules)
+    assert header.read_config(here)["env"] == {"name": "own_task:make_reacher", "size": 4}
+    assert refused(sejax.load, here) == "proxy"
+    assert set(sys.modules) == before
+    proxy = examples("own_proxy").LinearSE()
+    task = sejax.envs.make("own_task:make_reacher", size=4)
+    assert refused(sejax.load, here, task=task) == "proxy"
+    assert refused(sejax.load, here, proxy=proxy) == "task"
+    env, _ = sejax.load(here, task=task, proxy=proxy)
+    assert env.task is task and env.config == proxy
 
 
 # --- own_agent -----------------------------------------------------------------------------------
 
-OBS_DIM, ACTION_DIM, BATCH, HIDDEN = 3, 2, 5, 4
+OBS_DIM, ACTION_DIM, BATCH = 3, 2, 5
 
 
-class NumpySAC:
-    """SAC's losses once more, in float64, as Haarnoja et al. (2018) write them."""
+def flat(actor, critics, log_alpha):
+    """Parameters as sejax has them: one vector, kernels `[out, in]`."""
 
-    def __init__(self, params, target_critics, hparams):
-        self.params = params
-        self.target_critics, self.discount = target_critics, float(hparams.discount)
+    def turned(path, x):
+        return np.swapaxes(x, -2, -1) if path[-1].key == "kernel" else x
 
-    @staticmethod
-    def mlp(tree, x):
-        layers = [tree["params"][f"Dense_{i}"] for i in range(3)]
-        for layer in layers[:-1]:
-            x = np.maximum(x @ layer["kernel"] + layer["bias"], 0)
-        return x @ layers[-1]["kernel"] + layers[-1]["bias"]
-
-    def q_values(self, critics, obs, action):
-        inputs = np.concatenate([obs, action], axis=1)
-        return [self.mlp(jax.tree.map(lambda x, i=i: x[i], critics), inputs)[:, 0] for i in (0, 1)]
-
-    def sample(self, actor, obs, noise):
-        mean, log_std = np.split(self.mlp(actor, obs), 2, axis=1)
-        std = np.exp(np.clip(log_std, -20, 2))
-        action = np.tanh(mean + std * noise)
-        density = np.exp(-(noise**2) / 2) / (std * np.sqrt(2 * np.pi)) / (1 - action**2)
-        return action, np.log(density).sum(axis=1)
-
-    def losses(self, moved, batch, noise):
-        """Those of critics, actor and temperature, each with its own of `moved` parameters."""
-        now, alpha = self.params, np.exp(self.params["log_alpha"])
-        next_action, next_log_p = self.sample(now["actor"], batch["next_obs"], noise[1])
-        next_q = np.minimum(*self.q_values(self.target_critics, batch["next_obs"], next_action))
-        soft_value = next_q - alpha * next_log_p
-        target = batch["reward"] + self.discount * batch["discount"] * soft_value
-        errors = np.array(self.q_values(moved["critics"], batch["obs"], batch["action"])) - target
-        action, log_p = self.sample(moved["actor"], batch["obs"], noise[0])
-        q = np.minimum(*self.q_values(now["critics"], batch["obs"], action))
-        _, log_p_now = self.sample(now["actor"], batch["obs"], noise[0])
-        entropy_gap = -log_p_now - (-ACTION_DIM)
-        each = [
-            0.5 * (errors**2).sum(axis=0), alpha * log_p - q,
-            np.exp(moved["log_alpha"]) * entropy_gap,
-        ]  # fmt: skip
-        return sum(np.average(loss, weights=batch["weight"]) for loss in each)
+    trees = jax.tree_util.tree_map_with_path(turned, (actor, critics))
+    return np.append(raveled(trees), log_alpha)
 
 
-def test_a_sac_update_is_one_that_was_derived_anew(examples):
-    """Gradients of the losses above by differences; then Adam's first step and the soft update."""
+def test_a_sac_update_is_sejaxs(examples):
+    """Of the agent of the package, which equals torch's (test_sac.py)."""
     own_agent = examples("own_agent")
-    networks = own_agent.Networks(own_agent.Actor(ACTION_DIM, HIDDEN), own_agent.Critic(HIDDEN))
-    rng = np.random.default_rng(0)
+    options = {"batch_size": BATCH, "hidden_size": 4, "tau": 0.1, "discount": 0.9}
+    networks = own_agent.Networks(own_agent.Actor(ACTION_DIM, 4), own_agent.Critic(4))
     shapes = shapes_of(networks.init, jax.random.key(0), np.zeros(OBS_DIM), np.zeros(ACTION_DIM))
     params = random_like(shapes, seed=1)
     target_critics = jax.tree.map(lambda x: x + np.float32(0.1), params["critics"])
-    hparams = sejax.agents.traced(own_agent.SAC(discount=0.9, tau=0.1))
-    state = own_agent.SACState(params=params, target_critics=target_critics, hparams=hparams,
-                               opt_state=own_agent.ADAM.init(params),
-                               is_warming_up=jnp.bool_(False))  # fmt: skip
-    arrays = {"obs": rng.normal(size=(BATCH, OBS_DIM)), "reward": rng.normal(size=BATCH),
-              "action": rng.uniform(-1, 1, (BATCH, ACTION_DIM)),
-              "next_obs": rng.normal(size=(BATCH, OBS_DIM)),
-              "discount": rng.uniform(-0.2, 1.2, BATCH),
-              "weight": np.array([1, 1, 1, 1, 0])}  # fmt: skip
-    noise = rng.normal(size=(2, BATCH, ACTION_DIM))
+    state = own_agent.SACState(
+        params=params, target_critics=target_critics, opt_state=own_agent.ADAM.init(params),
+        is_warming_up=np.bool_(False), hparams=sejax.agents.traced(own_agent.SAC(**options)),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    arrays = {
+        "obs": rng.normal(size=(BATCH, OBS_DIM)),
+        "action": rng.uniform(-1, 1, (BATCH, ACTION_DIM)),
+        "reward": rng.normal(size=BATCH),
+        "discount": rng.uniform(-0.2, 1.2, BATCH),
+        "next_obs": rng.normal(size=(BATCH, OBS_DIM)),
+        "weight": np.array([1, 1, 1, 1, 0]),
+    }
     batch = sejax.agents.Transition(**{name: np.float32(x) for name, x in arrays.items()})
+    noise = np.float32(rng.normal(size=(2, BATCH, ACTION_DIM)))
     after = jax.jit(lambda *args: own_agent.learn(networks, *args))(state, batch, noise)
 
-    in_float64 = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, target_critics))
-    reference = NumpySAC(*in_float64, hparams)
-    leaves, structure = jax.tree.flatten(in_float64[0])
-    gradient = [np.zeros_like(leaf) for leaf in leaves]
-    for i, leaf in enumerate(leaves):
-        for place in np.ndindex(leaf.shape):
-            values = []
-            for step in (1e-6, -1e-6):
-                moved = [x.copy() for x in leaves]
-                moved[i][place] += step
-                values.append(reference.losses(structure.unflatten(moved), arrays, noise))
-            gradient[i][place] = (values[0] - values[1]) / 2e-6
-    # The first moment after the first step is a tenth of the gradient.
-    for got, expected in zip(jax.tree.leaves(after.opt_state.mu), gradient, strict=True):
-        np.testing.assert_allclose(10 * got, expected, rtol=1e-3, atol=1e-5)
-    is_clear = [np.abs(g) > 1e-4 for g in gradient]
-    for new, old, g, clear in zip(jax.tree.leaves(after.params), leaves, gradient, is_clear,
-                                  strict=True):  # fmt: skip
-        expected = old - hparams.learning_rate * np.sign(g)
-        np.testing.assert_allclose(np.asarray(new)[clear], expected[clear], rtol=1e-5, atol=1e-6)
-    mixed = jax.tree.map(lambda new, old: 0.1 * new + 0.9 * old, after.params["critics"],
-                         target_critics)  # fmt: skip
-    for got, expected in zip(jax.tree.leaves(after.target_critics), jax.tree.leaves(mixed),
-                             strict=True):  # fmt: skip
-        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-7)
+    config = sejax.SACConfig(**options, num_layers=2, activation="relu", learning_rate=1e-3,
+                             alpha=None, target_entropy=-1.0)  # fmt: skip
+    policy = sac.gaussian_policy(ACTION_DIM, 1.0)
+    agent = sac.make_sac(config, OBS_DIM, policy)
+    learn = sac.make_learning_step(sac.make_networks(config, OBS_DIM, policy), policy)
+    expected = shapes_of(agent.init, jax.random.key(0), agent.hparams).replace(
+        params=flat(**params), hparams=agent.hparams,
+        target_critics=flat(None, target_critics, [])
+    )  # fmt: skip
+    columns = sac.LearningNoise(action=noise[0].T, next_action=noise[1].T)
+    expected = jax.jit(learn)(expected, jax.tree.map(np.transpose, batch), columns)
+    moments = flat(**after.opt_state.mu)  # after the first step a tenth of the gradient
+    moments[-1] /= np.exp(params["log_alpha"])  # the temperature's loss: alpha, there its logarithm
+    np.testing.assert_allclose(moments, expected.opt_state.mu, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(flat(**after.params), expected.params, rtol=1e-5, atol=1e-6)
+    critics = flat(None, after.target_critics, [])
+    np.testing.assert_allclose(critics, expected.target_critics, rtol=1e-5, atol=1e-6)
 
 
 def test_the_reacher_is_solved_by_moving_towards_the_target(examples):

@@ -1,13 +1,13 @@
 """benchmarks/gpu.py on the CPU, and the loops that a GPU runs in blocks of steps."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from support import printed
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -22,9 +22,7 @@ def gpu(monkeypatch):
 
 def test_the_command_measures_and_writes_its_result(tmp_path):
     path = tmp_path / "gpu.json"
-    command = [sys.executable, str(BENCHMARKS / "gpu.py"), "--quick", "--json", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    said = printed(sys.executable, BENCHMARKS / "gpu.py", "--quick", "--json", path)
     result = json.loads(path.read_text())
     assert result["checks"] == {
         "largest_difference_of_weights": 0.0, "visits_of_the_host": 0, "copies_of_large_arrays": 0
@@ -34,7 +32,7 @@ def test_the_command_measures_and_writes_its_result(tmp_path):
     assert in_torch.get("steps", 16 * 64) == 16 * 64
     assert row["agents"] == 16 and row["steps"] == 16 * 64 and row["steps_per_s"] > 0
     assert 10 < result["kernels"]["quick DDQN"]["a_step"] < 100
-    assert "Kernels of an agent step" in done.stdout
+    assert "Kernels of an agent step" in said
 
 
 def test_kernels_are_counted_in_loops_and_functions_below_them(gpu):

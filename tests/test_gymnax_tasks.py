@@ -13,14 +13,14 @@ from gymnax.environments import spaces
 from gymnax.environments.classic_control import cartpole
 from gymnax.registration import registered_envs
 from gymnax.wrappers.purerl import StickyActionWrapper
-from support import paper_se
+from support import paper_se, refusal, refused
 
 import sejax
 from sejax import envs
 from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
 from sejax.envs.wrappers import AsVectors, Wrapper
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 
 DOWNLOADS = {"MNISTBandit-bsuite"}  # what it plays with
 # Not those that a test beside this one may have registered (`sejax.register_gymnax`).
@@ -82,22 +82,6 @@ def test_steps_are_those_of_gymnax_as_vectors(gymnax_id):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("gymnax_id", TAKEN)
-def test_agents_train_on_them_and_on_their_proxies(gymnax_id):
-    """By its types: what a loop carries must stay what it is."""
-    task = task_of(gymnax_id)
-    config = sejax.QLearningConfig()
-    if task.num_states is None:
-        config = sejax.DDQNConfig(hidden_size=2, num_layers=1, batch_size=2, warmup_episodes=0)
-    agent = sejax.make_agent(config, task)
-    training = sejax.TrainingConfig(max_episodes=2, max_steps=9, stop_rule="never")
-    for proxy in (paper_se(hidden_size=2), sejax.RewardConfig(hidden_size=2)):
-        env = registry.make("proxy", proxy, task)
-        evaluate = sejax.make_evaluator(agent, env, task, training)
-        outcome = jax.eval_shape(lambda key: evaluate(key, env.default_params), KEY)  # noqa: B023
-        assert outcome.test_returns.shape == (10,)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("proxy", ["se", "rn"])
 @pytest.mark.parametrize("gymnax_id", IDS)
@@ -126,25 +110,22 @@ def test_limit_and_threshold_are_those_asked_for_or_known():
     proxy = registry.make("proxy", paper_se(hidden_size=2), task)
     assert proxy.default_params.max_steps_in_episode == 7
     for limit in (0, 2**31):
-        with pytest.raises(ConfigError, match=r"^env\.max_steps must be"):
-            task_of("CartPole-v1", max_steps=limit)
+        assert refused(task_of, "CartPole-v1", max_steps=limit) == "env.max_steps"
     assert {x: task_of(x).solved_reward for x in SOLVED_REWARD} == SOLVED_REWARD
     unknown = task_of("Catch-bsuite")
     assert unknown.solved_reward == math.inf and not unknown.is_solvable
-    with pytest.raises(ConfigError, match=r"^objective must"):
-        sejax.RewardThreshold().make(unknown)
+    assert refused(sejax.RewardThreshold().make, unknown) == "objective"
 
 
 def test_an_id_that_is_unknown_or_cannot_be_made_is_one_message(monkeypatch):
-    with pytest.raises(ConfigError, match=r"^env must be one of gymnax/CartPole-v1, "):
-        task_of("CartPole-v7")
+    assert "env must be one of gymnax/CartPole-v1, " in str(refusal(task_of, "CartPole-v7"))
 
     def make(_):
         raise OSError("no network\nat all")
 
     monkeypatch.setattr(gymnax, "make", make)
-    with pytest.raises(ConfigError, match=r"^env must .*MNIST.* OSError: no network at all\.$"):
-        GymnaxTask(name=f"{PREFIX}MNISTBandit-bsuite").make()
+    error = refusal(GymnaxTask(name=f"{PREFIX}MNISTBandit-bsuite").make)
+    assert error.field == "env" and "OSError: no network at all." in str(error)
 
 
 def test_one_that_another_package_registers_is_a_task():
@@ -224,9 +205,7 @@ DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discr
     ],
 )
 def test_spaces_that_no_agent_could_use_are_refused(action, obs):
-    with pytest.raises(ConfigError) as error:
-        odd_task(action, obs)
-    assert error.value.field == "env"
+    assert refused(odd_task, action, obs) == "env"
 
 
 # --- environments with a fault -------------------------------------------------------------------
@@ -289,10 +268,9 @@ class Limit(NamedTuple):
 )
 def test_a_fault_is_told_before_an_agent_trains(env, options, fault):
     assert Task(name="mine", env=Plain()).max_steps == 3
-    with pytest.raises(ConfigError) as error:
-        Task(name="mine", env=env, **options)
-    assert error.value.field in ("env", "env.max_steps", "env.solved_reward")
-    assert fault in str(error.value) and len(str(error.value)) <= 300
+    error = refusal(Task, name="mine", env=env, **options)
+    assert error.field in ("env", "env.max_steps", "env.solved_reward")
+    assert fault in str(error)
 
 
 def branches(self, key, state, action, params):
@@ -321,9 +299,8 @@ def test_limits_may_be_numbers_of_numpy_and_jax():
 
 def test_a_wrapper_whose_step_would_never_be_called_is_refused_as_a_proxy_too():
     agent = sejax.make_agent(sejax.DDQNConfig(), Task(name="plain", env=cartpole.CartPole()))
-    with pytest.raises(ConfigError) as error:
-        sejax.make_trainer(agent, StickyActionWrapper(cartpole.CartPole(), 1.0))
-    assert error.value.field == "env"
+    wrapper = StickyActionWrapper(cartpole.CartPole(), 1.0)
+    assert refused(sejax.make_trainer, agent, wrapper) == "env"
 
 
 def test_a_wrapper_that_hands_on_what_it_does_not_change_is_taken():

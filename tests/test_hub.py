@@ -1,7 +1,7 @@
 """Proxies on the Hugging Face Hub: a server of this process stands for it (`fake_hub.py`)."""
 
-import builtins
 import importlib.util
+import sys
 
 import jax
 import numpy as np
@@ -76,14 +76,7 @@ def refusal(call, *args, field):
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
-    importing = builtins.__import__
-
-    def without_the_hub(name, *args, **kwargs):
-        if name.partition(".")[0] == "huggingface_hub":
-            raise ModuleNotFoundError("No module named 'huggingface_hub'")
-        return importing(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_the_hub)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     assert "sejax[hub]" in refusal(sejax.load, "hf://me/se", field="source")
     assert "sejax[hub]" in refusal(sejax.push, "cartpole", "me/se", field="repo")
 

@@ -2,7 +2,6 @@
 
 import functools
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -13,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from support import has_compiler, refusal
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import ConfigError
 
 gymnasium = pytest.importorskip("gymnasium")
 mujoco = pytest.importorskip("mujoco")
-if not any(map(shutil.which, (os.environ.get("CXX") or "c++", "c++", "g++", "clang++"))):
+if not has_compiler():
     pytest.skip("no C++ compiler", allow_module_level=True)
 
 from sejax.envs.mujoco import library  # noqa: E402, which imports mujoco
@@ -379,11 +378,10 @@ def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
     monkeypatch.setenv("SEJAX_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(library, "_load", library._load.__wrapped__)  # as if never loaded
     without(monkeypatch)
-    with pytest.raises(ConfigError) as error:
-        config.make()
-    message = str(error.value)
-    assert error.value.field == "env"
-    assert message.startswith(f"env={config.name} ") and said in message and len(message) <= 300
+    error = refusal(config.make)
+    message = str(error)
+    assert error.field == "env"
+    assert message.startswith(f"env={config.name} ") and said in message
     assert message.endswith(", or set env.backend=mjx.") == (config.name == "halfcheetah")
     assert unloadable_library is without or not list(tmp_path.iterdir())
 

@@ -5,7 +5,6 @@ import dataclasses
 import errno
 import functools
 import math
-import sys
 
 import chex
 import jax
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from support import paper_se
+from support import paper_se, refusal
 
 import sejax
 from sejax import envs
@@ -59,15 +58,6 @@ def rewrite(path, change):
     path.write_bytes(pack(*change(tensors, values)))
 
 
-def refusal(load, *args, **kwargs):
-    """The error that a call raises: one short message that names a field."""
-    with pytest.raises(ConfigError) as caught:
-        load(*args, **kwargs)
-    message = str(caught.value)
-    assert "\n" not in message and len(message) <= 300
-    return caught.value
-
-
 # --- round trips ---------------------------------------------------------------------------------
 
 
@@ -102,16 +92,6 @@ def test_no_path_of_the_machine_is_kept(path, env, weights):
     assert sejax.load_proxy(path).config["run_dir"] is None
 
 
-def test_a_loaded_proxy_steps_as_a_gymnax_environment():
-    env, params = sejax.load("cartpole")
-    obs, state = env.reset(jax.random.key(0), params)
-    key, action = jax.random.key(1), jnp.int32(1)
-    obs, _, reward, terminated, *_ = env.step(key, state, action, params)
-    assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
-    without = env.step(key, state, action)[2]  # as wrappers call it
-    assert jnp.isclose(without, reward, rtol=1e-5)  # another program, which may round otherwise
-
-
 @pytest.fixture(scope="module")
 def a_set(tmp_path_factory, env, weights):
     """A file of three proxies."""
@@ -143,21 +123,6 @@ def test_parts_of_a_set_are_chosen_by_score_and_place(a_set, weights):
     chosen = proxies[[2, 0]]
     assert_same_weights(chosen[0].params.weights, weights[2])
     assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
-
-
-def test_all_proxies_of_a_set_step_at_once(a_set):
-    proxies = sejax.load_set(a_set)
-    env, key = proxies.env, jax.random.key(0)
-
-    @jax.jit
-    def reward(weights):
-        params = env.params(weights, proxies.discount)
-        _, state = env.reset_env(key, params)
-        return env.step_env(key, state, jnp.int32(0), params)[2]
-
-    rewards = jax.vmap(reward)(proxies.weights)
-    np.testing.assert_allclose(rewards, [reward(x.params.weights) for x in proxies], rtol=1e-6)
-    assert len(set(rewards.tolist())) == 3
 
 
 def test_registering_with_gymnax_is_idempotent():
@@ -377,55 +342,6 @@ def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights,
     assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
     rewrite(path, lambda tensors, values: (tensors, "sejax", values | {"task": text}))
     assert text in str(refusal(sejax.load, path))
-
-
-MINE = """
-import dataclasses
-from sejax import envs
-from sejax.proxies.configs import RewardConfig
-
-@dataclasses.dataclass(frozen=True)
-class Room:
-    size: int = 2
-
-    def make(self):
-        return dataclasses.replace(envs.make("gridworld_2x2"), name="my_room", origin=None)
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Mine(RewardConfig):
-    mine: int = 3
-"""
-
-
-@pytest.fixture
-def mine(tmp_path, monkeypatch):
-    """A file of a foreign kind of proxy of a foreign task, whose module is not imported any more.
-
-    Returns the file, the task and the proxy's configuration.
-    """
-    (tmp_path / "my_file_worlds.py").write_text(MINE)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    task = envs.make("my_file_worlds:Room", size=3)
-    config = registry.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
-    env = registry.make("proxy", config, task)
-    path = tmp_path / "mine.safetensors"
-    sejax.save(path, env, env.init_weights(jax.random.key(0)), discount=0.7)
-    del sys.modules["my_file_worlds"]
-    return path, task, config
-
-
-def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine):
-    path, task, config = mine
-    stored = header.read_config(path)
-    assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
-    assert stored["proxy"]["name"] == "my_file_worlds:Mine"
-    before = set(sys.modules)
-    for given, field in (({}, "proxy"), ({"task": task}, "proxy"), ({"proxy": config}, "task")):
-        assert refusal(sejax.load, path, **given).field == field
-    assert set(sys.modules) == before
-    env, _ = sejax.load(path, task=task, proxy=config)
-    assert env.task is task and env.config == config
-    assert "my_file_worlds" not in sys.modules
 
 
 def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):

@@ -151,7 +151,6 @@ def test_a_score_transform_that_a_file_names_is_not_imported(folder, refused):
     (folder / "p.yaml").write_text(f"es.score_transform: {TRANSFORM}\n")
     said = refused(run_command, *TASK, "preset=p.yaml")
     assert "es.score_transform must be typed" in said
-    report.main([str(write_run(folder / "run", config))])
     write_proxy({"es": config["es"]})
     assert sejax.load_proxy("evil.safetensors").env.task.name == "cartpole"
 
