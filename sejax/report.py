@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sejax.cli import commands
 from sejax.options import registry, require
+from sejax.options.plain import expanded
 
 USAGE = """python -m sejax.report RUN_DIR... [out=FILE]
 
@@ -22,11 +23,11 @@ commands to go on. It is one HTML file that needs nothing else.
 
 def main(words: Sequence[str] | None = None) -> None:
     """Writes the report that the command line asks for; bad input ends it with one message."""
-    words = sys.argv[1:] if words is None else words
+    words = [expanded(word) for word in (sys.argv[1:] if words is None else words)]
     if {"--help", "-h"} & {*words}:
         print(USAGE)
         return
-    outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
+    outs = [expanded(word.removeprefix("out=")) for word in words if word.startswith("out=")]
     folders = [Path(word) for word in words if not word.startswith("out=")]
     with commands.messages():
         print(report(folders, Path(outs[-1]) if outs else None))

@@ -73,6 +73,12 @@ def require_run(stored: Mapping[str, Any]) -> None:
     int(stored["generations"])
 
 
+def title(stored: Mapping[str, Any]) -> str:
+    """What a picture of a stored run is of: task, proxy and agents."""
+    proxy = str(stored["proxy"]["name"]).upper()
+    return f"{stored['env']['name']}, {proxy}, {' + '.join(agent_names(stored))}"
+
+
 def agent_names(stored: Mapping[str, Any]) -> list[str]:
     """The agents of a stored run, by the names of their choices."""
     several = stored.get("agents") or {}

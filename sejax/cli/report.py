@@ -116,6 +116,7 @@ def _read(path: Path, name: str, place: int) -> Run:
     better = [row for row in rows if math.isfinite(row["incumbent_mean"])]
     best = max(better, key=lambda row: (row["incumbent_mean"], row["generation"]), default=None)
     incumbent = MISSING if best is None else spread(best["incumbent_mean"], best["incumbent_std"])
+    subject = next_steps.title(stored)
     title = _title(is_over, finished, asked, best, solved_score)
     task = str(stored["env"]["name"])
     facts = {
@@ -144,9 +145,9 @@ def _read(path: Path, name: str, place: int) -> Run:
         environment={k: text(v) for k, v in environment.items() if v is not None},
         rows=rows,
         solved_score=solved_score,
-        curve=report_figures.learning_curve(place, name, rows, solved_score, incumbent),
+        curve=report_figures.learning_curve(place, name, subject, rows, solved_score, incumbent),
         evaluation=evaluation,
-        agents=report_figures.evaluation(place, name, groups, solved_score, evaluation),
+        agents=report_figures.evaluation(place, name, subject, groups, solved_score, evaluation),
         commands=next_steps.of_stored(stored, path, more if is_over else asked),
     )
 

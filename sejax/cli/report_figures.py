@@ -39,11 +39,11 @@ class Figure(NamedTuple):
 
 
 def learning_curve(
-    place: int, name: str, rows: Rows, solved_score: float | None, best: str
+    place: int, name: str, title: str, rows: Rows, solved_score: float | None, best: str
 ) -> Figure:
     """How a run learned; `place` is its number on the page."""
     return Figure(
-        _svg(lambda path: plots.learning_curve(rows, solved_score, path), f"curve{place}"),
+        _svg(lambda path: plots.learning_curve(rows, solved_score, path, title), f"curve{place}"),
         f"Learning curve of {name}: scores of incumbent and population, and agents' training "
         f"steps, over {len(rows)} generations; best incumbent {best}.",
     )
@@ -52,6 +52,7 @@ def learning_curve(
 def evaluation(
     place: int,
     name: str,
+    title: str,
     groups: Mapping[tuple[str, str], Rows],
     solved_score: float | None,
     summaries: Sequence[Mapping[str, str]],
@@ -69,7 +70,9 @@ def evaluation(
         for row in summaries
     )
     return Figure(
-        _svg(lambda path: plots.evaluation(tables, solved_score, path), f"evaluation{place}"),
+        _svg(
+            lambda path: plots.evaluation(tables, solved_score, path, title), f"evaluation{place}"
+        ),
         f"Fresh agents of {name} on the real task. {about}.",
     )
 

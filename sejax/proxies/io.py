@@ -299,7 +299,7 @@ def _write(
             "sejax.config(...).plain() for config.",
             "config",
         ) from error
-    write_bytes(Path(path), data)
+    write_bytes(Path(path).expanduser(), data)
 
 
 def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
