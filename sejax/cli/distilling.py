@@ -84,10 +84,10 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
 
     Each block of generations up to a test is kept before the next begins.
     """
-    _remember(own, config, folder)
     task, options = config.task(), own.search
     made = make_search(options, task, config.devices)
     tested, rows = _restored(folder, made.init())
+    _remember(own, config, folder)
     keys = keys_of(config)
     print("searching a policy ...", flush=True)
     run = jax.jit(made.generation)
