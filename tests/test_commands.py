@@ -5,8 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import jax
 import pytest
@@ -70,8 +72,9 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
 
 
 def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
-    left = []
+    left, again = [], []
     monkeypatch.setattr(commands, "leave", left.append)
+    monkeypatch.setattr(threading, "Timer", lambda *call: again.append(call) or MagicMock())
     monkeypatch.setattr(sys, "argv", ["run"])
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(os, "environ", dict(os.environ))
@@ -79,6 +82,7 @@ def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
     for number in (signal.SIGTERM, signal.SIGINT):
         commands.start(lambda overrides, number=number: signal.raise_signal(number), str)
     signal.signal(signal.SIGTERM, before)
+    assert [call[2] for call in again] == [(os.getpid(), signal.SIGTERM)]
     assert left == [143, 130] and capsys.readouterr().out == "Interrupted.\n" * 2
 
 

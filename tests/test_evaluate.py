@@ -117,7 +117,7 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
         of_sarsa.train_steps.mean()
     )
     printed = capsys.readouterr().out
-    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 4
+    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
     assert is_drawn(tmp_path / "evaluation.png")
 
 

@@ -48,6 +48,10 @@ def start(
 
 def _stop(number: int, frame: object) -> NoReturn:
     """Hears SIGTERM as Ctrl-C is heard, with the exit code that shells give it."""
+    # Where a callback of a library forgets the exception, it is raised again.
+    again = threading.Timer(2.0, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
     raise KeyboardInterrupt(128 + number)
 
 
@@ -115,7 +119,7 @@ def fail(message: str, status: int) -> NoReturn:
 
 def interrupted(message: str, stop: KeyboardInterrupt) -> NoReturn:
     """Prints the message after Ctrl-C or SIGTERM, and ends the process at once."""
-    print(message)
+    print(message, flush=True)
     leave(stop.args[0] if stop.args else INTERRUPTED)
 
 

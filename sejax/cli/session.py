@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import dataclasses
 import platform
 import signal
 import threading
@@ -127,7 +128,8 @@ def run(
     restored = directory.restore(state)
     if restored is not None:
         # `stop_when_solved` may have changed.
-        state = restored.replace(solved=jax.numpy.bool_(learner.is_solved(restored.best_score)))
+        solved = jax.numpy.bool_(learner.is_solved(restored.best_score))
+        state = dataclasses.replace(restored, solved=solved)
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
         here = runtime.versions()
         if directory.versions != here:
@@ -205,8 +207,8 @@ def interrupts_held() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    for number in heard[:1]:
-        signal.raise_signal(number)
+    if heard:
+        signal.raise_signal(heard[0])
 
 
 class _Clock:
