@@ -94,6 +94,10 @@ class Bilevel:
         is_return = self.objective.scores_are_returns
         return task.solved_reward if is_return and task.is_solvable else None
 
+    def is_solved(self, score: Array) -> Array | bool:
+        """Whether a run ends at an incumbent mean."""
+        return self.stop_when_solved and score >= self.proxy.task.solved_reward
+
     def init(self, key: Array) -> LearnState:
         """The state before the first generation, with random weights of the proxy."""
         key_weights, key_es, key_run = jax.random.split(key, 3)
@@ -155,7 +159,6 @@ class Bilevel:
         scores = self.scoring.judged(outcome)
         score, by_agent = _or_lowest(scores.incumbent_mean), _or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
-        solved = self.stop_when_solved and score >= self.proxy.task.solved_reward
         after = state.replace(
             es_state=es_state,
             generation=state.generation + 1,
@@ -166,7 +169,7 @@ class Bilevel:
             best_score=jnp.where(is_best, score, state.best_score),
             best_scores=jnp.where(is_best, by_agent, state.best_scores),
             best_generation=jnp.where(is_best, state.generation, state.best_generation),
-            solved=state.solved | solved,
+            solved=state.solved | self.is_solved(score),
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved
@@ -189,6 +192,7 @@ def make_learner(
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
     Jitted it is one executable with the scan inside. `vmap` it over keys for several runs at once.
+    It cannot be pickled: send the configuration to another process, and build it there.
 
     Args:
       config: from `sejax.config`, in the place of all others. Its `seed`, `run_dir` and

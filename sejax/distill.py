@@ -7,8 +7,8 @@ from sejax.cli import commands, runtime
 from sejax.cli.distill_config import DistillConfig, folder_of, read
 from sejax.distillation.policy_copy import CopyConfig
 from sejax.distillation.policy_search import SearchConfig
-from sejax.ops.files import require_writable
-from sejax.options import ConfigError, as_text, help_texts, require
+from sejax.ops.files import FolderLock
+from sejax.options import as_text, help_texts, require
 from sejax.options.plain import fields_of, flatten, to_plain
 
 ABOUT = """Make an SE of a policy, and choose it by what it teaches.
@@ -31,31 +31,24 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides that cannot be, or a folder of another search.
       OSError: if a file cannot be written.
     """
-    import filelock
-
     from sejax.cli import distilling
 
     own, config = read(overrides)
     runtime.configure_jax()
-    folder = folder_of(config)
+    folder = folder_of(own, config)
     require(
         not (folder / "checkpoint.safetensors").exists(),
         "run_dir",
         f"must not be a run of sejax.run, whose proxy would be lost; got {folder}. Set "
         "run_dir=FOLDER.",
     )
-    require_writable("run_dir", folder)
+    lock = FolderLock(folder, "Set run_dir=FOLDER.")
     try:
-        with filelock.FileLock(folder / "sejax.lock", timeout=0):
-            distilling.distill(own, config, folder, shlex.join(overrides))
-    except filelock.Timeout as error:
-        raise ConfigError(
-            f"run_dir must be written by one command at a time; got {folder}. Set run_dir=FOLDER.",
-            "run_dir",
-        ) from error
-    except KeyboardInterrupt:
-        print(f"Interrupted. The same command goes on from {folder}.")
-        commands.leave(commands.INTERRUPTED)
+        distilling.distill(own, config, folder, shlex.join(overrides))
+    except KeyboardInterrupt as stop:
+        commands.interrupted(f"Interrupted. The same command goes on from {folder}.", stop)
+    finally:
+        lock.release(is_used=(folder / distilling.ASKED).exists())
 
 
 def help_text(overrides: Sequence[str]) -> str:

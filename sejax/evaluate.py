@@ -95,7 +95,8 @@ def evaluate(config: EvaluateConfig) -> float:
     _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png")
+    title = f"fresh {' + '.join(each.key for each in setup.members)} agents on {setup.task.name}"
+    plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png", title)
     first = table[table["world"] == next(iter(setup.worlds))]
     return float(first["test_return"].mean())
 

@@ -30,7 +30,7 @@ from sejax.ops.parallel import (
     spread_groups_over_devices,
     spread_over_devices,
 )
-from sejax.options import require
+from sejax.options import LARGEST, require
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import (
     TrainingConfig,
@@ -260,7 +260,8 @@ def make_evaluator(
         the same.
 
     Raises:
-      ConfigError: for arguments of other kinds.
+      ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
+        training.
 
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
 
@@ -280,6 +281,14 @@ def make_evaluator(
         "sejax.envs.make(name).",
     )
     require_training_config(training)
+    budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
+    require(
+        task.max_steps <= 1000 * budget,
+        "env.max_steps",
+        f"must end a test episode within 1,000 times the training budget of {training.max_steps} "
+        f"steps, because an agent may never end it; got {task.max_steps:,} for {task.name}. Set "
+        "env.max_steps=N, or Task(max_steps=N).",
+    )
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)

@@ -86,7 +86,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
     Those that differ from the one before in the seed alone run on its executable. At the end it
     prints where everything is and what to do next, or, of several runs, a line for each. Ctrl-C
-    leaves at once, with exit code 130: finished generations are saved.
+    and SIGTERM leave at once, with exit codes 130 and 143: finished generations are saved.
 
     Returns:
       The best incumbent score of each.
@@ -103,7 +103,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
             # Before the task is imported, so that a refusal is quick.
             with open_for(config) as directory, RunProgress(config) as progress:
                 try:
-                    progress.status("importing jax and the task")
+                    if compiled is None:
+                        progress.status("importing jax and the task")
                     from sejax.cli import session
 
                     program = dataclasses.replace(config, seed=0, run_dir=None)
@@ -113,13 +114,13 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         made = config.machines.make(config, print)
                         compiled, chunks = program, machines.enter_context(made)
                     ended = session.run(config, directory, chunks, progress)
-                except KeyboardInterrupt:
+                except KeyboardInterrupt as stop:
                     progress.stop()
-                    print(
+                    message = (
                         f"Interrupted. {directory.finished_generations} generations are saved in "
                         f"{directory.path}; the same command goes on from there."
                     )
-                    commands.leave(commands.INTERRUPTED)
+                    commands.interrupted(message, stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if ended == "diverged":
                     diverged.append(directory.path)

@@ -28,12 +28,12 @@ def main(overrides: Sequence[str]) -> None:
     search = search_config.read(overrides)
     try:
         command, settings = _study(search)
-    except KeyboardInterrupt:
-        _say(
+    except KeyboardInterrupt as stop:
+        message = (
             f"Interrupted. What has ended is saved in {search.folder}; the same command goes on "
             f"from there."
         )
-        commands.leave(commands.INTERRUPTED)
+        commands.interrupted(message, stop)
     if not settings:
         _say("No trial was completed.")
         return

@@ -23,6 +23,7 @@ from sejax.ops.loops import while_any_active
 from sejax.options import (
     LARGEST,
     Options,
+    as_text,
     counts,
     not_negative,
     one_of,
@@ -38,6 +39,17 @@ from sejax.proxies.io import Proxy, ProxySet, stored_env
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
+
+# Modes of jax in which programs of sejax fail: values that they may have, and why no others.
+MODES: dict[str, tuple[tuple[object, ...], str]] = {
+    "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
+    "jax_debug_nans": ((False,), "what has not happened is nan, and a training may diverge"),
+    "jax_debug_infs": ((False,), "the score before the first is minus infinity"),
+    "jax_debug_key_reuse": ((False,), "the state of a run that has ended keeps its key"),
+    "jax_numpy_rank_promotion": (("allow", "warn"), "operands are broadcast"),
+    "jax_numpy_dtype_promotion": (("standard",), "numbers of several types are combined"),
+    "jax_transfer_guard": (("allow", None, "log"), "numbers of Python are moved to devices"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +166,18 @@ def training_of(
         if is_registered("agent", values)
     ]
     return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
+
+
+def require_modes() -> None:
+    """Checks that jax is in no mode in which programs of sejax fail.
+
+    Raises:
+      ConfigError: of the mode, such as `jax_enable_x64`.
+    """
+    for mode, (allowed, reason) in MODES.items():
+        got = getattr(jax.config, mode)
+        off = f"Set {mode.upper()}={as_text(allowed[0])}."
+        require(got in allowed, mode, f"must be {as_text(allowed[0])}: {reason}; got {got}. {off}")
 
 
 def require_training_config(training: Any) -> None:
@@ -377,11 +401,7 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
         "Set agent=sejax.make_agent(config, task) with that task.",
     )
     require_training_config(training)
-    require(
-        not jax.config.jax_enable_x64,
-        "jax_enable_x64",
-        "must be off: sejax computes in 32 bits; got true. Set JAX_ENABLE_X64=0.",
-    )
+    require_modes()
 
 
 class _Loop:

@@ -4,16 +4,23 @@ import functools
 import io
 import os
 import runpy
+import signal
 import subprocess
 import sys
+import threading
 import warnings
+from importlib.util import find_spec
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import jax
 import pytest
 
+import sejax
 from sejax import __main__ as program
 from sejax.cli import commands, runtime
-from sejax.options import FailedError
+from sejax.options import ConfigError, FailedError
+from sejax.options.plain import expanded
 
 
 def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
@@ -154,3 +161,58 @@ def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
 
     with pytest.raises(TypeError):
         ended(monkeypatch, capsys, main)
+
+
+def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
+    left, again = [], []
+    monkeypatch.setattr(commands, "leave", left.append)
+    monkeypatch.setattr(threading, "Timer", lambda *call: again.append(call) or MagicMock())
+    monkeypatch.setattr(sys, "argv", ["run"])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    before = signal.getsignal(signal.SIGTERM)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        commands.start(lambda overrides, number=number: signal.raise_signal(number), str)
+    signal.signal(signal.SIGTERM, before)
+    assert [call[2] for call in again] == [(os.getpid(), signal.SIGTERM)]
+    assert left == [143, 130] and capsys.readouterr().out == "Interrupted.\n" * 2
+
+
+@pytest.mark.parametrize("platform", ["cuda", "nonsense"])
+def test_a_platform_that_jax_lacks_is_one_line_with_the_variable(platform, tmp_path):
+    if platform == "cuda" and find_spec("jax_cuda12_plugin"):
+        pytest.skip("jax has CUDA here")
+    words = [sys.executable, "-m", "sejax.run", f"run_dir={tmp_path / 'run'}"]
+    ended = subprocess.run(
+        words, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": platform}
+    )
+    assert ended.returncode == commands.BAD_INPUT and not (tmp_path / "run").exists()
+    assert ended.stderr.splitlines()[-1] == (
+        "error: JAX_PLATFORMS must name what jax was installed for and finds here; got "
+        f"{platform}. Set JAX_PLATFORMS=cpu."
+    )
+
+
+@pytest.mark.parametrize(
+    ("mode", "value"),
+    [("jax_debug_nans", True), ("jax_debug_infs", True), ("jax_debug_key_reuse", True),
+     ("jax_enable_x64", True), ("jax_disable_jit", True), ("jax_transfer_guard", "disallow"),
+     ("jax_numpy_rank_promotion", "raise"), ("jax_numpy_dtype_promotion", "strict")],
+)  # fmt: skip
+def test_a_mode_of_jax_that_cannot_be_is_one_line_with_its_name(mode, value):
+    before = getattr(jax.config, mode)
+    jax.config.update(mode, value)
+    try:
+        with pytest.raises(ConfigError) as error:
+            runtime.configure_jax()
+    finally:
+        jax.config.update(mode, before)
+    assert error.value.field == mode and f"Set {mode.upper()}=" in str(error.value)
+
+
+def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert sejax.config(["run_dir=~/a"]).resolved_run_dir == Path("/home/me/a")
+    assert expanded("sqlite:///~/a.db") == "sqlite:////home/me/a.db"
+    for text in ("a~", "~me/a", "/a/~/b", "a:b"):
+        assert expanded(text) == text

@@ -1,6 +1,8 @@
 """`python -m sejax.distill`: the command, its files, resuming, and policies that it is given."""
 
 import shutil
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -8,7 +10,7 @@ import pytest
 
 import sejax
 from sejax.cli import distilling
-from sejax.cli.distill_config import read
+from sejax.cli.distill_config import folder_of, read
 from sejax.distill import help_text, main
 from sejax.ops import checksummed
 from sejax.options import ConfigError
@@ -211,3 +213,35 @@ def test_help_names_every_field():
     own = text.partition("their defaults:")[2].strip().splitlines()
     texts = [line.partition("#")[2].strip() for line in own]
     assert len(own) > 20 and sum(map(bool, texts)) > 15  # names that explain themselves have none
+
+
+def test_the_default_folder_tells_policies_apart():
+    names = []
+    for words in ([], ["policy=ppo:a/model.zip"], ["policy=dqn:model.zip"], ["policy=linear.npz"],
+                  ["policy=mine:act"]):  # fmt: skip
+        names.append(folder_of(*read(["env=cartpole", *words])).name)
+    assert names == ["distill-cartpole-s0", "distill-cartpole-ppo-model-s0",
+                     "distill-cartpole-dqn-model-s0", "distill-cartpole-linear-s0",
+                     "distill-cartpole-mine-act-s0"]  # fmt: skip
+
+
+def test_a_refused_command_leaves_nothing(tmp_path):
+    for policy in ("nothing.npz", "nothing:act", f"{__name__}:out_of_range"):
+        with pytest.raises(ConfigError, match="policy must"):
+            main([*QUICK, f"run_dir={tmp_path / 'runs' / 'a'}", f"policy={policy}"])
+        assert not (tmp_path / "runs").exists()
+
+
+def test_a_model_of_another_algorithm_is_one_line(tmp_path, monkeypatch):
+    class DQN:
+        @staticmethod
+        def load(path, device):
+            raise AttributeError("'ActorCriticPolicy' object has no attribute 'q_net'")
+
+    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace(DQN=DQN))
+    (tmp_path / "ppo.zip").write_bytes(b"")
+    with pytest.raises(
+        ConfigError, match=r"policy must be a model that DQN saved; got dqn:.*q_net"
+    ):
+        main([*QUICK, f"run_dir={tmp_path / 'run'}", f"policy=dqn:{tmp_path}/ppo.zip"])
+    assert not (tmp_path / "run").exists()

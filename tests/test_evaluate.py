@@ -1,12 +1,15 @@
 """`python -m sejax.evaluate`: fresh agents on a stored proxy, and on the real task."""
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import io
 import json
+import pickle
 import sys
 
+import gymnax
 import jax
 import pandas as pd
 import pytest
@@ -17,12 +20,14 @@ import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.cli import commands, progress
+from sejax.cli import commands, plots, progress
 from sejax.cli import config as configuration
 from sejax.cli.config import members_of
 from sejax.cli.worlds import proxy_setup
 from sejax.evaluate import evaluate, summarise
+from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
+from sejax.ops.files import require_writable
 from sejax.options import ConfigError, registry
 from sejax.training import budget_for
 
@@ -112,7 +117,7 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
         of_sarsa.train_steps.mean()
     )
     printed = capsys.readouterr().out
-    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 4
+    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
     assert is_drawn(tmp_path / "evaluation.png")
 
 
@@ -395,3 +400,51 @@ def test_an_evaluations_mean_leaves_no_agent_out():
         False, True, False], "train_steps": 5, "train_episodes": 1})  # fmt: skip
     row = summarise(agents, ["world"]).loc["w"]
     assert (row["test_return_mean"], row["num_nonfinite"]) == (-10.0, 1)
+
+
+def test_a_test_that_may_never_end_is_refused_beside_the_training_budget():
+    env = gymnax.make("Pendulum-v1")[0]
+    task = sejax.Task(name="endless", env=env, max_steps=1_000_000_000)
+    agent = sejax.make_agent(sejax.TD3Config(), task)
+    training = sejax.TrainingConfig(max_steps=60, max_episodes=60)
+    with pytest.raises(ConfigError, match=r"of 60\ssteps.* got 1,000,000,000 for endless") as error:
+        make_evaluator(agent, env, task, training)
+    assert error.value.field == "env.max_steps"
+
+
+def test_an_evaluation_in_a_pipe_says_what_it_trains_and_leaves_no_folder_if_refused(
+    room, tmp_path, capsys
+):
+    evaluate(evaluate_config(f"proxy={room}", "num_agents=2", f"out_dir={tmp_path}", words=ROOM))
+    said = capsys.readouterr().out
+    assert "training 2 agents on the proxy ...\n" in said
+    require_writable("out_dir", tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("varied", [False, True])
+def test_an_agent_can_be_pickled_and_one_with_other_numbers_is_not_made_anew(varied):
+    task = sejax.envs.make("cartpole")
+    agent = sejax.make_agent(sejax.DDQNConfig(learning_rate=0.25), task, varied=varied)
+    again = pickle.loads(pickle.dumps(agent))
+    assert again.hparams == agent.hparams and again.spec == agent.spec
+    assert (again.varied is None) == (agent.varied is None)
+    changed = dataclasses.replace(agent, hparams=None)
+    assert copy.copy(changed).hparams is None
+    with pytest.raises(AttributeError):
+        pickle.dumps(changed)
+
+
+def test_pictures_have_panels_only_of_what_varies(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "_write", lambda figure, path: drawn.append(figure))
+    names = ("incumbent_mean", "incumbent_std", "population_mean", "population_max")
+    for steps in ([5, 5], [5, 6]):
+        rows = [{"generation": i, "train_steps_mean": x} | dict.fromkeys(names, 1.0)
+                for i, x in enumerate(steps)]  # fmt: skip
+        plots.learning_curve(rows, None, tmp_path, "cartpole, SE, ddqn")
+        table = {"test_return": [1.0, 1.0], "train_steps": [7, 7], "train_episodes": steps}
+        plots.evaluation({("the proxy", "ddqn"): table}, None, tmp_path, "ddqn on cartpole")
+    assert [len(figure.axes) for figure in drawn] == [1, 1, 2, 2]
+    assert drawn[0].axes[0].get_title() == "cartpole, SE, ddqn"
+    assert drawn[1].get_suptitle() == "ddqn on cartpole"

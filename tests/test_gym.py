@@ -339,7 +339,8 @@ def test_continuous_actions_are_clipped_to_the_bounds(stored):
 
 def test_what_ships_is_registered_once_and_by_its_name():
     ids = sejax.gym.register()
-    assert ids == sejax.gym.register() == [f"sejax/{name}" for name in pretrained_names()]
+    names = [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
+    assert ids == sejax.gym.register() == names
     env = gymnasium.make("sejax/cartpole")
     assert env.spec.id == "sejax/cartpole" and "TimeLimit" not in str(env)
     assert str(gymnasium.make(env.spec)) == str(gymnasium.make("sejax.gym:sejax/cartpole"))
@@ -491,3 +492,34 @@ def test_vector_environments_take_a_render_mode_as_single_ones_do():
     assert refused(sejax.gym.make_vec, "cartpole", 2, render_mode="human") == "render_mode"
     envs_of_rn = sejax.gym.make_vec("mountain_car_continuous-rn", 1, render_mode="rgb_array")
     assert envs_of_rn.envs[0].render_mode == "rgb_array"
+
+
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_ids_that_name_the_package_are_known_in_new_processes(context):
+    """In a fresh process, as the test's own has what its processes would need to import."""
+    program = f"""
+import gymnasium
+
+def make():
+    return gymnasium.make("sejax.gym:sejax/cartpole")
+
+if __name__ == "__main__":
+    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="{context}")
+    print(envs.reset(seed=0)[0].shape, gymnasium.spec("sejax/cartpole").id)
+    envs.close()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.stdout == "(2, 4) sejax/cartpole\n", ended.stderr
+
+
+@pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])
+def test_what_has_no_picture_says_so(env):
+    with pytest.raises(NotImplementedError, match="no picture"):
+        env.render()
+
+
+def test_a_proxy_is_found_from_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "a.safetensors").write_bytes(find("cartpole").read_bytes())
+    assert make("~/a.safetensors").observation_space.shape == (4,)
+    assert sejax.load("~/a.safetensors")[0].task.name == "cartpole"

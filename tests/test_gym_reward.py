@@ -161,13 +161,26 @@ def test_weighted_info_is_a_product(tmp_path, variant):
     assert reward == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("real", [np.nan, np.inf, -2e6])
+@pytest.mark.parametrize("real", [np.nan, np.inf])
 def test_an_absurd_reward_is_none_and_terminates(tmp_path, real):
     path, _ = stored_rn(tmp_path, 2, variant="additive_potential")
     env = RewardNetwork(Walk(reward=real), path)
     env.reset()
     _, reward, terminated, _, info = env.step([0.5])
     assert reward == 0.0 and terminated is True and info["discount"] == 0.0
+
+
+@pytest.mark.parametrize(("variant", "passes"), [("additive_potential", True),
+                                                 ("exclusive_potential", False)])  # fmt: skip
+def test_real_rewards_of_money_size_pass_and_learned_ones_do_not(tmp_path, variant, passes):
+    path, _ = stored_rn(tmp_path, 2, variant=variant)
+    env = RewardNetwork(Walk(reward=-2e7), path)
+    env.reset()
+    _, reward, terminated, _, info = env.step([0.5])
+    assert (reward == pytest.approx(-2e7, abs=10)) == passes and not terminated
+    assert info["real_reward"] == -2e7
+    env.potential = lambda *_: 1e9
+    assert env.step([0.5])[1:3] == (0.0, True)
 
 
 @pytest.mark.slow

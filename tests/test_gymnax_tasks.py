@@ -284,11 +284,10 @@ def reads(self, key, state, action, params):
 
 @pytest.mark.parametrize("step_env", [branches, reads])
 def test_a_fault_in_code_of_ones_own_is_told_with_its_place(step_env):
-    with pytest.raises(ConfigError) as error:
-        Task(name="mine", env=with_fault(step_env=step_env))
-    said, line = str(error.value), step_env.__code__.co_firstlineno + 1
+    error = refusal(Task, name="mine", env=with_fault(step_env=step_env))
+    said, line = str(error), step_env.__code__.co_firstlineno + 1
     source = Path(__file__).read_text().splitlines()[line - 1].strip()
-    assert error.value.field == "env" and "use jnp.where" in said
+    assert error.field == "env" and "use jnp.where" in said
     assert f"test_gymnax_tasks.py:{line}: {source[:60]}" in said and "Derive it" not in said
 
 

@@ -218,6 +218,23 @@ def test_an_absurd_reward_ends_the_episode_instead_of_poisoning_the_agent(value,
     assert info["discount"] == 0  # nothing is learned from what would come after
 
 
+@pytest.mark.parametrize("real", [1e7, np.inf])
+def test_real_rewards_of_money_size_pass_and_infinite_ones_do_not(real):
+    class Rich(cartpole.CartPole):
+        def step_env(self, key, state, action, params):
+            obs, state, _, *rest = super().step_env(key, state, action, params)
+            return obs, state, jnp.float32(real), *rest
+
+    task = sejax.Task(name="rich", env=Rich(), max_steps=9)
+    env = registry.make("proxy", RewardConfig(hidden_size=5), task)
+    params = env.params(env.init_weights(jax.random.key(0)))
+    _, state = env.reset_env(jax.random.key(0), params)
+    _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
+    is_paid = np.isfinite(real)
+    assert bool(terminated) != is_paid and info["nonfinite"] != is_paid
+    assert np.isclose(reward, real if is_paid else 0.0, atol=10)
+
+
 # --- agents on it --------------------------------------------------------------------------------
 
 

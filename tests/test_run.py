@@ -373,6 +373,39 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     assert (tmp_path / "proxy.safetensors").exists()
 
 
+def test_sigterm_saves_and_exits_143(tmp_path):
+    words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
+    ended = process(sys.executable, "-c", DRIVER, "SIGTERM", *words)
+    assert ended.returncode == 143, ended.stderr
+    assert "the same command goes on from there" in ended.stdout
+    count = len(rows(tmp_path))
+    assert "Going on at generation" in learn(tmp_path, f"generations={count + 1}")
+
+
+def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, capsys):
+    run.main([*TINY, f"run_dir={tmp_path}"])
+    said = capsys.readouterr().out
+    assert "compiling ...\n" in said
+    counted = [x.split("/")[0] for x in said.splitlines() if x.startswith("generation ")]
+    assert counted == [f"generation {row['generation']}" for row in rows(tmp_path)]
+    assert "generation 2/2: incumbent" in said  # the last one
+
+
+def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
+    solving = session.make_chunks(sejax.config([*TINY, "stop_when_solved=true"]))
+
+    def go(generations, program):
+        stop = f"stop_when_solved={'true' if program is solving else 'false'}"
+        words = [*TINY, stop, f"generations={generations}", f"run_dir={tmp_path}"]
+        config = sejax.config(words)
+        with run_directory.open_for(config) as directory:
+            return session.run(config, directory, program)
+
+    assert go(6, solving) == "solved" and len(rows(tmp_path)) == 3
+    assert go(6, chunks()) == "finished" and rows(tmp_path) == rows(uninterrupted)
+    assert go(9, solving) == "solved" and rows(tmp_path) == rows(uninterrupted)
+
+
 def test_an_interrupt_waits_until_files_are_written():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     written = []

@@ -4,7 +4,9 @@ import contextlib
 import io
 import os
 import re
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -40,6 +42,8 @@ def start(
       config_text: what `--print-config` prints, if the command has this option.
     """
     words = sys.argv[1:]
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _stop)
     with messages(), registry.only_typed(words):
         options = [*HELP, *([PRINT_CONFIG] if config_text else [])]
         overrides = _prepared(words, options)
@@ -49,6 +53,15 @@ def start(
             print(config_text(overrides), end="")
         else:
             main(overrides)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    """Hears SIGTERM as Ctrl-C is heard, with the exit code that shells give it."""
+    # Where a callback of a library forgets the exception, it is raised again.
+    again = threading.Timer(2.0, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
+    raise KeyboardInterrupt(128 + number)
 
 
 def _prepared(words: Sequence[str], known: Sequence[str]) -> list[str]:
@@ -88,9 +101,12 @@ def _devices(overrides: Sequence[str]) -> int | None:
 def messages() -> Iterator[None]:
     """Within it, bad input and files that fail end the process with one message."""
     try:
-        yield
+        with runtime.platform_named():
+            yield
     except ConfigError as error:
         fail(str(error), BAD_INPUT)
+    except KeyboardInterrupt as stop:
+        interrupted("Interrupted.", stop)
     except BrokenPipeError:  # the reader has seen enough
         leave(0)
     except FailedError as error:
@@ -112,6 +128,12 @@ def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(status)
+
+
+def interrupted(message: str, stop: KeyboardInterrupt) -> NoReturn:
+    """Prints the message after Ctrl-C or SIGTERM, and ends the process at once."""
+    print(message, flush=True)
+    leave(stop.args[0] if stop.args else INTERRUPTED)
 
 
 def leave(status: int) -> NoReturn:

@@ -32,6 +32,7 @@ from sejax.options import (
 )
 from sejax.options.plain import (
     RENAMED,
+    expanded,
     fields_of,
     flatten,
     merge,
@@ -141,7 +142,7 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
         )
         given[name] = unquoted(text)
     if str(given.get("preset", "")).endswith(preset_files.ENDING):
-        given = preset_files.read_file(Path(given.pop("preset"))) | given
+        given = preset_files.read_file(Path(expanded(given.pop("preset")))) | given
     return given
 
 

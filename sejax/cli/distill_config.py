@@ -136,7 +136,11 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     return own, config
 
 
-def folder_of(config: LearnConfig) -> Path:
-    """The command's folder: `run_dir`, or one named by task and seed."""
-    name = as_file_name(f"distill-{config.name('env')}-s{config.seed}")
+def folder_of(own: DistillConfig, config: LearnConfig) -> Path:
+    """The command's folder: `run_dir`, or one named by task, given policy and seed."""
+    algorithm, _, path = (own.policy or "").rpartition(":")
+    given = (
+        f"-{algorithm}-{Path(path).stem}" if algorithm else f"-{Path(path).stem}" if path else ""
+    )
+    name = as_file_name(f"distill-{config.name('env')}{given}-s{config.seed}")
     return Path(config.run_dir or f"runs/{name}")

@@ -51,6 +51,7 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       ConfigError: for a folder of another search, or a policy that cannot be.
       OSError: if a file cannot be written.
     """
+    _require_same(own, config, folder)
     find = search if own.policy is None else copied
     lessons, costs = find(own, config, folder)
     env, weights = teaching.make_ses(config.task(), lessons, **own.of_ses)
@@ -83,11 +84,12 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
 
     Each block of generations up to a test is kept before the next begins.
     """
-    _require_same(own, config, folder)
     task, options = config.task(), own.search
     made = make_search(options, task, config.devices)
     tested, rows = _restored(folder, made.init())
+    _remember(own, config, folder)
     keys = keys_of(config)
+    print("searching a policy ...", flush=True)
     run = jax.jit(made.generation)
     test, record = jax.jit(made.test), jax.jit(made.record)
     while (block := _next_block(options, rows)) is not None:
@@ -115,7 +117,7 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
         _keep(folder, tested, rows)
         steps = sum(each["real_steps"] for each in rows)
         print(
-            f"start {block.start + 1}/{options.num_starts}, generation "
+            f"start {block.start}/{options.num_starts - 1}, generation "
             f"{last}/{options.generations}: policy {row['test_mean']:.1f} ± "
             f"{row['test_std']:.1f}, {steps:,} real steps",
             flush=True,
@@ -180,9 +182,9 @@ def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     task = config.task()
     assert own.policy is not None
     given = policies.policy_of(own.policy, task)
-    _require_same(own, config, folder)
     started, key = time.process_time(), keys_of(config)["record"]
     if given.layers is None:
+        print("copying the policy ...", flush=True)
         made = copy_policy(own.copy, task, given.act, key)
         lesson = Lesson(0, made.layers, made.states, made.policy_return)
         real_steps = made.real_steps
@@ -192,6 +194,7 @@ def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
         lesson = Lesson(0, given.layers, seen.states, float(seen.returns.mean()))
         real_steps = len(seen.states)
         print(f"policy {lesson.policy_return:.1f}", flush=True)
+    _remember(own, config, folder)
     return [lesson], {"cpu_s": time.process_time() - started, "real_steps": real_steps}
 
 
@@ -203,10 +206,9 @@ def asked(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
 
 
 def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None:
-    """Writes what was asked for, or checks that it is what the folder was made with."""
+    """Checks that what is asked for is what the folder was made with, if it is not new."""
     path, wanted = folder / ASKED, asked(own, config)
     if not path.exists():
-        write_text(path, yaml.safe_dump(wanted, sort_keys=False))
         return
     try:
         stored = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -225,6 +227,11 @@ def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None
         f"must hold what the same command made; got {folder}, with {differing}. Set "
         "run_dir=FOLDER, another one.",
     )
+
+
+def _remember(own: DistillConfig, config: LearnConfig, folder: Path) -> None:
+    """Writes what was asked for, when there is something to keep."""
+    write_text(folder / ASKED, yaml.safe_dump(asked(own, config), sort_keys=False))
 
 
 def _keep(folder: Path, tested: list[Policy], rows: list[dict[str, Any]]) -> None:
@@ -288,6 +295,7 @@ def students(
         path = folder / "students" / f"{use}-{member.key}-{taught_by}.csv"
         if not path.exists():
             agent = make_agent(member.agent, task, config.exploration)
+            print(f"training {len(keys) * len(lessons)} {member.key} students ...", flush=True)
             started = time.process_time()
             taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
             new = teaching.as_rows(taught, lessons, member.key, use)

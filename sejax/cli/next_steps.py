@@ -1,7 +1,8 @@
 """What can be done with a run: the command that goes on with it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def evaluate_words(proxy: Path | str, env_name: str, kind: str, agents: Sequence[str]) -> list[str]:
@@ -19,3 +20,16 @@ def evaluate_words(proxy: Path | str, env_name: str, kind: str, agents: Sequence
     if any(":" in name for name in agents):  # which are imported only if they are named
         words.append(f"agents=[{','.join(agents)}]" if len(agents) > 1 else f"agent={agents[0]}")
     return [*words, "num_agents=20"]
+
+
+def title(stored: Mapping[str, Any]) -> str:
+    """What a picture of a stored run is of: task, proxy and agents."""
+    proxy = str(stored["proxy"]["name"]).upper()
+    return f"{stored['env']['name']}, {proxy}, {' + '.join(agent_names(stored))}"
+
+
+def agent_names(stored: Mapping[str, Any]) -> list[str]:
+    """The agents of a stored run, by the names of their choices."""
+    several = stored.get("agents") or {}
+    members = [each for each in several.values() if isinstance(each, dict)]
+    return [str(each["name"]) for each in members or [stored["agent"]]]

@@ -19,49 +19,63 @@ AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f
 
 
 def learning_curve(
-    rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path
+    rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path, title: str
 ) -> None:
-    """Draws `learning_curve.png`: scores above, agents' training steps below.
+    """Draws `learning_curve.png`: scores above, agents' training steps below where they vary.
 
     Args:
       rows: rows of `metrics.csv`, as text or numbers.
       solved_score: the task's threshold, drawn as a line; None if scores are not returns.
       path: the picture.
+      title: what was learned.
     """
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
     with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
-        figure, (top, bottom) = plt.subplots(
-            2, 1, figsize=(7, 5.5), sharex=True, height_ratios=(2, 1), layout="constrained"
+        steps = [x for name, x in data.items() if name.startswith("train_steps_mean")]
+        heights = (2, 1) if any(map(_varies, steps)) else (2,)
+        figure, axes = plt.subplots(
+            len(heights),
+            squeeze=False,
+            figsize=(7, 1 + 1.5 * sum(heights)),
+            sharex=True,
+            height_ratios=heights,
+            layout="constrained",
         )
+        top, bottom = axes[0, 0], axes[-1, 0]
         label = "incumbent: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
-        bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
         agents = [name for name in data if name.startswith("incumbent_mean_")]
         for name, color in zip(agents, itertools.cycle(AGENTS)):
             agent = name.removeprefix("incumbent_mean_")
             top.plot(x, data[name], color=color, lw=1.3, ls="-.", label=f"incumbent: {agent}")
-            bottom.plot(x, data[f"train_steps_mean_{agent}"], color=color, lw=1, ls="-.")
+            if bottom is not top:
+                bottom.plot(x, data[f"train_steps_mean_{agent}"], color=color, lw=1, ls="-.")
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
             top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
         top.set_ylabel("score" if solved_score is None else "return on the real task")
+        top.set_title(title)
         top.legend(frameon=False, fontsize=9, loc="best")
-        bottom.set_ylabel("training steps\nof an agent")
-        bottom.set_xlabel("NES generation")
-        steps = [x for name, x in data.items() if name.startswith("train_steps_mean")]
-        bottom.set_ylim(0, max(1.1 * np.nanmax(steps), 1.0))
+        bottom.set_xlabel("generation")
+        if bottom is not top:
+            bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
+            bottom.set_ylabel("training steps\nof an agent")
+            bottom.set_ylim(0, max(1.1 * np.nanmax(steps), 1.0))
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
 
 def evaluation(
-    tables: Mapping[tuple[str, str], Mapping[str, Any]], solved_reward: float | None, path: Path
+    tables: Mapping[tuple[str, str], Mapping[str, Any]],
+    solved_reward: float | None,
+    path: Path,
+    title: str,
 ) -> None:
-    """Draws what agents trained in each world reached and what it took.
+    """Draws what agents trained in each world reached and, where it varies, what it took.
 
     A column for each world, in it one for each agent of several, each with its colour.
 
@@ -70,21 +84,26 @@ def evaluation(
         with a number for each agent.
       solved_reward: the task's threshold; None or infinite if there is none.
       path: the picture.
+      title: who was trained.
     """
     worlds, keys = (list(dict.fromkeys(names)) for names in zip(*tables, strict=True))
     width = len(keys) + (0.5 if len(keys) > 1 else 0)
     places = {(world, key): width * worlds.index(world) + keys.index(key) for world, key in tables}
-    panels = (
-        ("test_return", "return on the real task"),
-        ("train_steps", "training steps"),
-        ("train_episodes", "training episodes"),
-    )
+    panels = {"test_return": "return on the real task"}
+    for column in ("train_steps", "train_episodes"):
+        if _varies(np.concatenate([table[column] for table in tables.values()])):
+            panels[column] = column.replace("train_", "training ")
     rng = np.random.default_rng(0)
     with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
         figure, axes = plt.subplots(
-            1, 3, figsize=(9 + 2.5 * (len(keys) - 1), 3.4), layout="constrained"
+            1,
+            len(panels),
+            squeeze=False,
+            figsize=(len(panels) * (3 + 0.8 * (len(keys) - 1)), 3.4),
+            layout="constrained",
         )
-        for axis, (column, label) in zip(axes, panels, strict=True):
+        figure.suptitle(title, fontsize=11)
+        for axis, (column, label) in zip(axes[0], panels.items(), strict=True):
             for (world, key), table in tables.items():
                 index, values = places[world, key], np.asarray(table[column], float)
                 color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
@@ -112,10 +131,14 @@ def evaluation(
             if column != "test_return":
                 axis.set_ylim(bottom=0)
         if len(keys) > 1:
-            axes[0].legend(frameon=False, fontsize=9)
+            axes[0, 0].legend(frameon=False, fontsize=9)
         if solved_reward is not None:
-            axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+            axes[0, 0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
+
+
+def _varies(numbers: np.ndarray) -> bool:
+    return np.unique(numbers).size > 1
 
 
 def _write(figure: Figure, path: Path) -> None:

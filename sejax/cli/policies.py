@@ -93,7 +93,14 @@ def _of_sb3(text: str, task: Task) -> Actor:
         ) from error
     cls = getattr(stable_baselines3, name.upper(), None)
     require(cls is not None, "policy", must)
-    model = cls.load(path, device="cpu")  # type: ignore[union-attr]
+    try:
+        model = cls.load(path, device="cpu")  # type: ignore[union-attr]
+    except Exception as error:  # whatever lacks where another algorithm looks for it
+        raise ConfigError(
+            f"policy must be a model that {name.upper()} saved; got {text} ({told(error)}). Set "
+            "policy=ALGORITHM:FILE.zip, with the algorithm of the file.",
+            "policy",
+        ) from error
     size, wanted = model.observation_space.shape, (task.obs_dim,)
     require(
         size == wanted,

@@ -25,18 +25,21 @@ if TYPE_CHECKING:  # the first line is shown before jax is imported
 
 
 class Tally:
-    """One live line on a terminal: how many are done of all, and the time left; nothing elsewhere.
+    """One live line on a terminal: how many are done of all, and the time left.
+
+    Elsewhere one line says what is being done.
 
     Example:
       >>> with Tally(20, "agents on the proxy") as tally:
       ...     tally.add(5)
-      >>> tally.is_live
-      False
+      training 20 agents on the proxy ...
     """
 
     def __init__(self, total: int, things: str, console: Console | None = None):
         console = console or Console(highlight=False, markup=False)
         self.is_live = console.is_terminal
+        if not self.is_live:
+            print(f"training {total:,} {things} ...", flush=True)
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.description}"),
@@ -74,7 +77,6 @@ class RunProgress(Reporter):
         self._live = self._console.is_terminal
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("generation {task.completed}/{task.total}"),
             BarColumn(bar_width=16),
             TextColumn("{task.description}"),
             TextColumn("left"),
@@ -105,6 +107,8 @@ class RunProgress(Reporter):
         """Shows what is being done before the first generation."""
         self._progress.update(self._task, description=text)
         self._started = time.monotonic()
+        if not self._live:
+            self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
         """Prints a line that stays."""
@@ -116,6 +120,7 @@ class RunProgress(Reporter):
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values = info.values
         text = (
+            f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
             f"incumbent {self._score(values['incumbent_mean'])} ± "
             f"{self._score(values['incumbent_std'])}{self._of_agents(values)}, "
             f"best {self._score(values['best_so_far'])}, "
@@ -123,10 +128,9 @@ class RunProgress(Reporter):
         )
         if values["num_nonfinite"]:
             text += f", {values['num_nonfinite']:.0f} diverged"
-        done = info.generation + 1
-        self._progress.update(self._task, completed=done, description=text)
+        self._progress.update(self._task, completed=info.generation + 1, description=text)
         if not self._live:
-            self.say(f"generation {done}/{self._config.generations}: {text}")
+            self.say(text)
 
     def _score(self, score: float) -> str:
         return f"{score:.1f}"

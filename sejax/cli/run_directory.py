@@ -8,22 +8,19 @@ refused changes nothing.
 Nothing here imports jax before a state is restored or saved, so that a refusal is quick.
 """
 
-import contextlib
 import json
-import os
 import secrets
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-import filelock
 import numpy as np
 import yaml
 
 from sejax.cli import runtime
 from sejax.ops import checksummed
-from sejax.ops.files import remove_leftovers, write_bytes, write_text
-from sejax.options import ConfigError, shortened
+from sejax.ops.files import FolderLock, remove_leftovers, write_bytes, write_text
+from sejax.options import ConfigError
 from sejax.options.plain import differences
 
 if TYPE_CHECKING:  # which import jax
@@ -53,10 +50,18 @@ COLUMNS = (
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
 # Fields and groups that say how or how long to compute, not what: they may change between two
 # sessions of a run.
-FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
+FREE_FIELDS = {
+    "generations",
+    "stop_when_solved",
+    "devices",
+    "checkpoint_every",
+    "run_dir",
+    "tracker",
+    "machines",
+}
 HINT = "Set run_dir=FOLDER."
 
-_CHECKPOINT, _LOCK = "checkpoint.safetensors", "sejax.lock"
+_CHECKPOINT = "checkpoint.safetensors"
 _METRICS, _CONFIG = "metrics.csv", "config.yaml"
 _KIND, _FORMAT_VERSION, _STATE, _ROWS = "sejax_run", 1, "state", "metrics"
 # Files whose temporaries a killed session leaves.
@@ -118,8 +123,7 @@ class RunDirectory:
         self._agents, self._hint = agents if len(agents) > 1 else (), hint
         self._csv = _as_csv([self.columns])
         self._state: dict[str, np.ndarray] | None = None
-        self._made = [x for x in (self.path, *self.path.parents) if not os.path.exists(x)]
-        self._lock = self._locked()
+        self._lock = FolderLock(self.path, hint)
         try:
             self._open(completed)
         except BaseException:
@@ -128,14 +132,7 @@ class RunDirectory:
 
     def close(self) -> None:
         """Lets other processes use the folder; without a run there, leaves nothing behind."""
-        if not self._lock.is_locked:
-            return
-        if not (self.path / _CHECKPOINT).exists():
-            (self.path / _LOCK).unlink(missing_ok=True)
-            for folder in self._made:
-                with contextlib.suppress(OSError):  # it is not empty
-                    folder.rmdir()
-        self._lock.release()
+        self._lock.release(is_used=(self.path / _CHECKPOINT).exists())
 
     def __enter__(self) -> "RunDirectory":
         return self
@@ -201,7 +198,7 @@ class RunDirectory:
           OSError: if a file cannot be written; the checkpoint is then whole, this one or the one
             before.
         """
-        if not (self.path / _LOCK).exists():
+        if not (self.path / FolderLock.NAME).exists():
             raise FileNotFoundError(f"{self.path} was removed while its run went on")
         rows = self._rows_of(info, wall_s)
         csv = self._csv + _as_csv([row.values() for row in rows])
@@ -226,21 +223,6 @@ class RunDirectory:
     def write_summary(self, **values: Any) -> None:
         """Writes `run.json`."""
         write_text(self.path / "run.json", json.dumps(values, indent=2) + "\n")
-
-    def _locked(self) -> filelock.BaseFileLock:
-        """Makes the folder and locks it; the lock ends with the process, however that ends."""
-        lock = filelock.FileLock(self.path / _LOCK, timeout=0, thread_local=False)
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock.acquire()
-        except filelock.Timeout:
-            self._refuse(
-                f"must be used by one at a time; got {self.path}, which another process uses"
-            )
-        except (OSError, ValueError, NotImplementedError) as error:
-            got = f"{shortened(self.path)} ({shortened(error)})"
-            self._refuse(f"must be a folder that can be written; got {got}")
-        return lock
 
     def _open(self, completed: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
         """Reads the checkpoint, if there is one, and compares the configuration with its own."""

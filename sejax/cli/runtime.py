@@ -6,9 +6,11 @@ import math
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from sejax.ops import files
+from sejax.options import ConfigError, require
 
 CGROUPS = Path("/sys/fs/cgroup")
 _NEVER_SECONDS = 1_000_000
@@ -40,6 +42,29 @@ def is_started() -> bool:
     from jax._src import xla_bridge
 
     return bool(xla_bridge.backends_are_initialized())
+
+
+@contextlib.contextmanager
+def platform_named() -> Iterator[None]:
+    """Within it, errors that come of a platform that jax lacks name the variable at fault.
+
+    Raises:
+      ConfigError: in the place of such an error.
+    """
+    try:
+        yield
+    except (ValueError, RuntimeError, AssertionError) as error:  # jax's, or a plugin's that met it
+        asked = os.environ.get("JAX_PLATFORMS")
+        if not asked or "jax" not in sys.modules or is_started():
+            raise
+        import jax
+
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError):
+            message = f"must name what jax was installed for and finds here; got {asked}."
+            raise ConfigError(f"JAX_PLATFORMS {message} Set JAX_PLATFORMS=cpu.") from error
+        raise
 
 
 def configure_xla(num_devices: int | None = None) -> None:
@@ -100,9 +125,17 @@ def configure_jax() -> None:
     Compiled programs are kept between runs, in a folder for this kind of CPU: code compiled for
     another one is rejected or unsafe, so that the folder's name depends on the CPU's model and
     features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
+
+    Raises:
+      ConfigError: for a mode of jax in which programs of sejax fail.
     """
     import jax
 
+    from sejax.training import require_modes
+
+    require_modes()
+    must = "must be false, as commands compile their programs; got true. Set JAX_DISABLE_JIT=0."
+    require(not jax.config.jax_disable_jit, "jax_disable_jit", must)
     if jax.config.jax_default_matmul_precision is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     root = files.cache_folder()

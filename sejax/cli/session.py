@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import dataclasses
 import platform
 import signal
 import threading
@@ -15,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.cli import plots, runtime
+from sejax.cli import next_steps, plots, runtime
 from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
@@ -127,7 +128,9 @@ def run(
     state = chunks.init(jax.random.key(config.seed))
     restored = directory.restore(state)
     if restored is not None:
-        state = restored
+        # `stop_when_solved` may have changed.
+        solved = jax.numpy.bool_(learner.is_solved(restored.best_score))
+        state = dataclasses.replace(restored, solved=solved)
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
         here = runtime.versions()
         if directory.versions != here:
@@ -197,23 +200,26 @@ def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Ctrl-C is heard at the end of the block.
+    """Ctrl-C and SIGTERM are heard at the end of the block.
 
     Within, files are being written, and jax's caches call back from weak references, where Python
     prints an exception and forgets it: the run would go on.
     """
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
     heard: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    for number in handlers:
+        signal.signal(number, lambda number, frame: heard.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
     if heard:
-        raise KeyboardInterrupt
+        signal.raise_signal(heard[0])
 
 
 class _Clock:
@@ -281,7 +287,8 @@ def draw(directory: RunDirectory, learner: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
         path = directory.path / "learning_curve.png"
-        plots.learning_curve(directory.rows, learner.solved_score, path)
+        title = next_steps.title(directory.config)
+        plots.learning_curve(directory.rows, learner.solved_score, path, title)
 
 
 def _finished(rows: list[dict[str, str]], info: GenerationInfo) -> Iterator[FinishedGeneration]:

@@ -56,6 +56,7 @@ def open_study(search: Search, current: Mapping[str, object] | None = None) -> o
     one_by_one: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
     if search.config.storage is None:  # or two workers would make the tables of a new file
         require_writable("search_dir", search.folder)
+        search.folder.mkdir(parents=True, exist_ok=True)
         one_by_one = filelock.FileLock(search.folder / "study.lock")
     with one_by_one:
         study = optuna.create_study(

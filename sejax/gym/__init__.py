@@ -2,12 +2,13 @@
 
 `make` makes an environment of a synthetic environment (SE) or a reward network (RN), `make_vec` and
 `make_sb3` vector environments, and `RewardNetwork` puts an RN around an environment that you have.
-Importing this registers what ships with the package, as `sejax/<name>`. Neither JAX nor gymnax is
-loaded, so that environments fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`.
-How to use it all: docs/gymnasium.md.
+Importing this registers what ships with the package, as `sejax/<name>`; Gymnasium imports it for
+`sejax.gym:sejax/<name>`, in other processes too. Neither JAX nor gymnax is loaded, so that
+environments fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`. How to use it
+all: docs/gymnasium.md.
 
 Example:
-  >>> env = gymnasium.make("sejax/cartpole")  # or make(...), of a run directory or a file
+  >>> env = gymnasium.make("sejax.gym:sejax/cartpole")  # or make(...), of a run directory
   >>> obs, info = env.reset(seed=0)
   >>> obs, reward, terminated, truncated, info = env.step(1)
   >>> obs.shape, terminated, truncated  # episodes of the shipped SEs have one step

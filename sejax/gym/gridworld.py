@@ -1,6 +1,6 @@
 """Grid worlds as Gymnasium environments, for the tasks that Gymnasium has not."""
 
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -77,3 +77,7 @@ class GridWorld(gymnasium.Env[int, int]):
         terminated = cell in "GO"
         self._index = None if terminated else obs
         return obs, self._rewards[cell], terminated, False, {}
+
+    def render(self) -> NoReturn:
+        """Raises `NotImplementedError`: there is no picture."""
+        raise NotImplementedError("a GridWorld has no picture: its observations are cell numbers")

@@ -131,16 +131,17 @@ def register() -> list[str]:
     """Registers the shipped proxies as `sejax/<name>`; importing `sejax.gym` does it.
 
     Returns:
-      The ids, for `gymnasium.make` and `gymnasium.make_vec`.
+      The ids for `gymnasium.make` and `gymnasium.make_vec`, which import this package first: in the
+      processes of vector environments too.
 
     Example:
-      >>> register()[0], gymnasium.make("sejax/acrobot").action_space
-      ('sejax/acrobot', Discrete(3))
+      >>> register()[0], gymnasium.make("sejax.gym:sejax/acrobot").action_space
+      ('sejax.gym:sejax/acrobot', Discrete(3))
     """
     specs = [_spec(name, source=name) for name in pretrained_names()]
     for spec in specs:
         gymnasium.registry.setdefault(spec.id, spec)
-    return [spec.id for spec in specs]
+    return [f"sejax.gym:{spec.id}" for spec in specs]
 
 
 def _spec(name: str, **kwargs: Any) -> EnvSpec:

@@ -32,8 +32,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     :math:`\Phi` the network, agents get r or 0 (additive or exclusive) plus
     :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential,
     non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the
-    episode has terminated and 1 elsewhere. A reward that is not finite or beyond 1e6 is 0 and
-    terminates.
+    episode has terminated and 1 elsewhere. A reward that is not finite, or whose learned part is
+    beyond 1e6, is 0 and terminates.
 
     A gamma belongs to a potential, and it is the agent's: the default is that of the agent which
     the RN was learned with.
@@ -117,10 +117,10 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         obs, real_reward, terminated, truncated, info = self.env.step(action)
         real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
         ends = terminated or (truncated and self.limit_is_terminal)
-        reward = self._bonus(obs, self._told(info), ends)
+        reward = bonus = self._bonus(obs, self._told(info), ends)
         if self.config.shaping.is_additive:
             reward += real_reward
-        if not abs(reward) < MAX_ABS_VALUE:  # nan is not either
+        if not (np.isfinite(reward) and abs(bonus) < MAX_ABS_VALUE):
             reward, terminated = 0.0, True
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
@@ -235,6 +235,10 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         self._vector = None if terminated or truncated else step.vector
         info = {"discount": float(step.discount)}
         return self._observe(step.vector), float(step.reward), terminated, truncated, info
+
+    def render(self) -> NoReturn:
+        """Raises `NotImplementedError`: the states of an SE have no picture."""
+        raise NotImplementedError("an SE's states have no picture: render its real task")
 
     def _observe(self, vector: np.ndarray) -> Any:
         obs = self.world.observe(vector)

@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import filelock
+
 from sejax.options import ConfigError, shortened
 
 
@@ -20,7 +22,7 @@ def cache_folder() -> Path | None:
     """
     root = os.environ.get("SEJAX_CACHE_DIR")
     if root is not None:
-        return Path(root) if root else None
+        return Path(os.path.expanduser(root)) if root else None
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sejax"
     except RuntimeError:
@@ -28,20 +30,71 @@ def cache_folder() -> Path | None:
 
 
 def require_writable(field: str, folder: Path) -> None:
-    """Makes a folder and checks that files can be written there.
+    """Checks that files can be written in a folder, which may be new; leaves nothing there.
 
     Raises:
       ConfigError: of this field, if they cannot.
     """
+    made = _missing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        _remove_empty(made)
     except (OSError, ValueError) as error:
         got = shortened(error)
         raise ConfigError(
             f"{field} must be a folder that can be written; got {got}. Set {field}=FOLDER.", field
         ) from error
+
+
+class FolderLock:
+    """A folder that this process alone uses until `release`."""
+
+    NAME = "sejax.lock"
+
+    def __init__(self, folder: Path, hint: str):
+        """Makes the folder and locks it; the lock ends with the process, however that ends.
+
+        Args:
+          folder: the `run_dir` of a command.
+          hint: last sentence of messages: how to choose another folder.
+
+        Raises:
+          ConfigError: if another process uses it, or it cannot be written.
+        """
+        self._folder, self._made = folder, _missing(folder)
+        self._lock = filelock.FileLock(folder / self.NAME, timeout=0, thread_local=False)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+        except filelock.Timeout as error:
+            must = f"must be used by one at a time; got {folder}, which another process uses"
+            raise ConfigError(f"run_dir {must}. {hint}", "run_dir") from error
+        except (OSError, ValueError, NotImplementedError) as error:
+            got = f"{shortened(folder)} ({shortened(error)})"
+            must = f"must be a folder that can be written; got {got}"
+            raise ConfigError(f"run_dir {must}. {hint}", "run_dir") from error
+
+    def release(self, is_used: bool) -> None:
+        """Lets other processes use the folder; leaves nothing behind unless `is_used`."""
+        if not self._lock.is_locked:
+            return
+        if not is_used:
+            (self._folder / self.NAME).unlink(missing_ok=True)
+            _remove_empty(self._made)
+        self._lock.release()
+
+
+def _missing(folder: Path) -> list[Path]:
+    """A folder and those above it that are not there, the innermost first."""
+    return [x for x in (folder, *folder.parents) if not os.path.exists(x)]
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):  # it is not empty
+            folder.rmdir()
 
 
 @contextlib.contextmanager

@@ -6,6 +6,8 @@ text of an override for a number. Nothing is guessed, resolved, imported or exec
 """
 
 import dataclasses
+import os
+import re
 import types
 import typing
 from collections.abc import Collection, Mapping
@@ -170,7 +172,7 @@ def _scalar(value: Any, kind: type) -> Any:
     """A value as a bool, int, float or str; `_NO` if it is none."""
     if kind is str:
         is_name = type(value) in (int, float)  # a name of digits, as of a folder
-        return value if isinstance(value, str) else str(value) if is_name else _NO
+        return expanded(value) if isinstance(value, str) else str(value) if is_name else _NO
     if isinstance(value, str):
         value = parsed(value)
     if kind is float and type(value) is int and abs(value) < 2**1000:
@@ -256,6 +258,16 @@ def split(text: str) -> list[str]:
         else:
             parts[-1] += character
     return [part.strip() for part in parts] if len(parts) > 1 else parts
+
+
+def expanded(text: str) -> str:
+    """A text with the user's home folder in the place of a path's `~`.
+
+    Example:
+      >>> expanded("ppo:~/model.zip") == "ppo:" + os.path.expanduser("~/model.zip")
+      True
+    """
+    return re.sub(r"(^|:|:///)~(?=/|$)", lambda found: found[1] + os.path.expanduser("~"), text)
 
 
 def unquoted(text: str) -> str:

@@ -14,8 +14,9 @@ from sejax.options import Options
 if TYPE_CHECKING:
     from sejax.proxies.base import ProxyEnv
 
-# A reward or an entry of a state beyond this ends the episode. It is far outside every task's range
-# and small enough for its square to stay finite in float32.
+# A reward or an entry of a state that networks make ends the episode beyond this; what is the real
+# task's own may be larger. It is far outside what networks of sane weights make, and small enough
+# for its square to stay finite in float32.
 MAX_ABS_VALUE = 1e6
 
 

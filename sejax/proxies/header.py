@@ -25,7 +25,7 @@ from sejax.options import (
     shortened,
     unknown_name,
 )
-from sejax.options.plain import from_plain
+from sejax.options.plain import expanded, from_plain
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -189,7 +189,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         return hub.fetch(str(source), option)
     text = shortened(source)
     try:
-        path = Path(source)
+        path = Path(expanded(source) if isinstance(source, str) else source)
         is_run = path.is_dir()
         file = path / hub.FILE if is_run else path
         if file.is_file():

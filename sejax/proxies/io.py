@@ -332,7 +332,7 @@ def _write(
             "sejax.config(...).plain() for config.",
             "config",
         ) from error
-    write_bytes(Path(path), data)
+    write_bytes(Path(path).expanduser(), data)
 
 
 def _tensors_of(env: ProxyEnv, weights: PyTree) -> dict[str, np.ndarray]:

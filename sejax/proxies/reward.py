@@ -74,8 +74,9 @@ class RewardEnv(ProxyEnv):
     variants, baselines of the authors' code, weigh the numbers i' in the step's `info`
     (`Task.info_keys`) and have no network.
 
-    `info["real_reward"]` is r. A reward that is not finite, or beyond `MAX_ABS_VALUE`, is 0 and
-    ends the episode; `info["nonfinite"]` says whether it was not finite.
+    `info["real_reward"]` is r, of any size. A reward that is not finite, or whose learned part is
+    beyond `MAX_ABS_VALUE`, is 0 and ends the episode; `info["nonfinite"]` says whether it was not
+    finite.
     """
 
     config: "RewardConfig"
@@ -187,10 +188,10 @@ class RewardEnv(ProxyEnv):
             augmentation=_select(info, self._augmented_keys),
             time=state.time + 1,
         )
-        reward = self.bonus(params, state, next_state, info, terminated)
+        reward = bonus = self.bonus(params, state, next_state, info, terminated)
         if self.config.shaping.is_additive:
-            reward = real_reward + reward
-        is_sane = jnp.abs(reward) < MAX_ABS_VALUE  # False for nan
+            reward = real_reward + bonus
+        is_sane = jnp.isfinite(reward) & (jnp.abs(bonus) < MAX_ABS_VALUE)
         discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
