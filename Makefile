@@ -35,8 +35,8 @@ test-suites: TESTS := stoa
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
 test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes torch_vectorised
 
-# The newest trackers: trackio and constraints.txt have no pillow in common.
-test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'
+# Weights & Biases and TensorBoard's event files.
+test-trackers: PACKAGES := --constraint constraints.txt --editable '.[tensorboard,wandb]'
 test-trackers: TESTS := trackers
 
 # A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.
