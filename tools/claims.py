@@ -94,12 +94,16 @@ class Claims:
         if "*" in rows:
             found = sorted(self.root.glob(rows))
             return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
+        rows, _, variant = rows.partition("#")
         path = self.root.resolve() / rows
         if path.name.endswith("summary.csv") and path in self.summaries:
             return pd.read_csv(io.StringIO(self.summaries[path]))
         if not path.exists():
             raise WrongError(f"there are no rows {rows}")
-        return yaml.safe_load(path.read_text()) if path.suffix == ".json" else read_rows(path)
+        if path.suffix == ".json":
+            return yaml.safe_load(path.read_text())
+        found = read_rows(path)
+        return found[found["variant"] == variant] if variant else found
 
     def selected(self, entry: Mapping[str, Any]) -> dict[str, Any]:
         """The frames of an entry by name; one file is `rows`."""
@@ -247,7 +251,7 @@ class Claims:
 
         Rows are written again when columns move, settings when their format does.
         """
-        rows = rows.replace("summary.csv", "rows.csv.xz")
+        rows = rows.partition("#")[0].replace("summary.csv", "rows.csv.xz")
         paths = [{"pretrained": "sejax/pretrained"}.get(rows, rows)]
         paths += [str(path) for path in (self.root / rows).parent.glob("settings.json*")]
         git = ["git", "-C", str(self.root), "log", "-1", "--format=%ct %h %cs", "--"]
