@@ -192,7 +192,7 @@ def test_an_experiment_runs_and_resumes_and_remakes_its_report(
     assert settings.summary_file.exists()
     assert settings.rows_file.exists()
     figures = list(tmp_path.glob("*.png"))
-    assert figures and all(map(is_drawn, figures))
+    assert all(map(is_drawn, figures)) and (figures or name == "timings")
     text = (tmp_path / f"{prefix}table.md").read_text()
     assert f"`python -m experiments.{name} quick=true" in text and str(table.iloc[0, 0]) in text
 

@@ -138,27 +138,6 @@ def test_intervals_are_over_ses_and_not_agents_but_on_the_real_task():
     assert "[" not in se_performance.make_table("cartpole", few)["return"][0]
 
 
-def test_a_tuned_agent_is_a_baseline_of_its_own():
-    settings = se_performance.SePerformance.of(max_steps=700, real_groups=2)
-    task = envs.make("cartpole")
-    real = se_performance.on_real(settings, task, {}, "ddqn")
-    tuned = se_performance.on_real_tuned(settings, real, "ddqn")
-    assert (real.hparams, tuned.hparams) == ("varied", "default")
-    assert (real.agent.hidden_size, tuned.agent.hidden_size) == (128, 64)
-    assert real.training.time_limit_is_terminal and not tuned.training.time_limit_is_terminal
-    assert tuned.training.max_steps == 700
-    assert [group.name for group in tuned.groups] == ["real-00", "real-01"]
-
-    steps = {"real": 1000.0, "tuned": 400.0, "fixed": 100.0}
-    agents = pd.concat(
-        made_up_agents().assign(kind="ddqn", setting=name, train_steps=value)
-        for name, value in steps.items()
-    )
-    table = se_performance.make_table("cartpole", se_performance.summarise(agents, 195))
-    assert table["fewer"].tolist() == ["", "60%", "90%"]
-    assert table["than tuned"].tolist() == ["", "", "75%"]
-
-
 def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
     agents = made_up_agents()
     agents.loc[(agents["group"] == "se0") & (agents["agent"] % 2 == 1), "test_return"] = 999

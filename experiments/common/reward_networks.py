@@ -2,8 +2,8 @@
 
 RNs are learned once and shared by all experiments: those of a task, variant and objective are one
 file, `<rns_dir>/<env>/<objective>/<variant>.safetensors`, and the curves of the NES runs of all
-variants lie beside it, `curves.csv.xz`. Runs that were interrupted go on, and where more RNs are asked for than a file holds only
-the further ones are learned.
+variants lie beside it, `curves.csv.xz`. Runs that were interrupted go on, and where more RNs are
+asked for than a file holds only the further ones are learned.
 
 Differs: on HalfCheetah the unseen agent, PPO, has the ICM and the number of episodes of TD3; the
 authors' scripts have others for it (`docs/reference.md` 4.8 and 7.3). TD3 is the quick one of
