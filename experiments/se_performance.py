@@ -199,7 +199,9 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
     steps = summary[summary["setting"] == "real"].set_index("kind")["train_steps_mean"]
 
     def fewer(row: Any) -> str:
-        return "" if row.setting == "real" else f"{1 - row.train_steps_mean / steps[row.kind]:.0%}"
+        if row.setting == "real" or row.kind not in steps:
+            return ""
+        return f"{1 - row.train_steps_mean / steps[row.kind]:.0%}"
 
     def paper(numbers: Mapping[Any, Mapping[str, str]]) -> Callable[[Any], str]:
         return lambda row: numbers.get((env_name, row.kind), {}).get(row.setting, "")
