@@ -33,10 +33,10 @@ test-suites: TESTS := stoa
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
-test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes torch_vectorised
+test-examples: TESTS := examples gym_sb3 torch_reference torch_nes
 
-# The newest trackers: trackio and constraints.txt have no pillow in common.
-test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'
+# Weights & Biases and TensorBoard's event files.
+test-trackers: PACKAGES := --constraint constraints.txt --editable '.[tensorboard,wandb]'
 test-trackers: TESTS := trackers
 
 # A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.

@@ -3,10 +3,10 @@
 Each family trains `--agents` agents for `--steps` steps on a fresh SE of the paper's kind, soft and
 with the task's step limit. Hyperparameters are the paper's: for DDQN those of CartPole, with the SE
 of its table, for PPO `PPOConfig.paper()`, for the others the defaults.
-Families with a PyTorch reference are measured at those of `preset=best` as well, where networks and
-batches are small. Agents learn from the first step on; training never stops early, and a fresh SE
-hardly ever ends an episode. PPO learns when its rollout is full: it trains for a multiple of that
-many steps, at least two, so that acting and learning have their usual shares.
+DDQN, which PyTorch trains too, and PPO are measured at those of `preset=best` as well, where
+networks and batches are small. Agents learn from the first step on; training never stops early, and
+a fresh SE hardly ever ends an episode. PPO learns when its rollout is full: it trains for a
+multiple of that many steps, at least two, so that acting and learning have their usual shares.
 
 sejax trains the agents as the commands do, through `spread_over_devices` and with the agent's own
 number of agents in parallel, but on one device. PyTorch trains `--torch-agents` of them one after
@@ -20,7 +20,6 @@ sejax's.
 
 import argparse
 import functools
-import importlib
 import os
 from dataclasses import dataclass, replace
 from typing import Any
@@ -42,13 +41,13 @@ class Family:
     Attributes:
       agent: name of the agent.
       env: name of the task that the SE stands in for.
-      reference: the PyTorch module with `train(env, config, seed)`, if there is one.
+      in_torch: whether `torch_reference.py` has the agent too.
       settings: "paper" or "best": whose hyperparameters.
     """
 
     agent: str
     env: str
-    reference: str | None = None
+    in_torch: bool = False
     settings: str = "paper"
 
     def parts(self, steps: int) -> tuple[Any, SyntheticConfig, TrainingConfig]:
@@ -82,24 +81,19 @@ PAPERS: dict[str, dict[str, Any]] = {  # the paper's default agents
     "td3_discrete": _LAYERS | {"batch_size": 128, "learning_rate": 5e-4},
     "td3": _LAYERS | {"batch_size": 256, "learning_rate": 3e-4, "tau": 0.005},
 }
-WITH_REFERENCE = [
-    Family(agent="ddqn", env="cartpole", reference="torch_reference"),
-    Family(agent="td3", env="pendulum", reference="torch_reference_td3"),
-    Family(agent="ppo", env="cartpole", reference="torch_reference_ppo"),
-]
-OTHERS = [
-    Family(agent="ppo", env="cartpole", settings="best"),  # generalised advantages, as no reference
-    Family(agent="dueling_ddqn", env="cartpole"),
-    Family(agent="td3_discrete", env="cartpole"),
-    Family(agent="q_learning", env="cliff_walking"),
-    Family(agent="sarsa", env="cliff_walking"),
-]
 FAMILIES = {
     f"{family.agent}, {family.settings}": family
     for family in [
-        *WITH_REFERENCE,
-        *(replace(family, settings="best") for family in WITH_REFERENCE if family.agent != "ppo"),
-        *OTHERS,
+        Family(agent="ddqn", env="cartpole", in_torch=True),
+        Family(agent="ddqn", env="cartpole", in_torch=True, settings="best"),
+        Family(agent="td3", env="pendulum"),
+        Family(agent="td3", env="pendulum", settings="best"),
+        Family(agent="ppo", env="cartpole"),
+        Family(agent="ppo", env="cartpole", settings="best"),
+        Family(agent="dueling_ddqn", env="cartpole"),
+        Family(agent="td3_discrete", env="cartpole"),
+        Family(agent="q_learning", env="cliff_walking"),
+        Family(agent="sarsa", env="cliff_walking"),
     ]
 }
 
@@ -123,7 +117,7 @@ def main() -> None:
         os.sched_setaffinity(0, {args.core})
         SIDES[args.side](args)
         return
-    names = args.families or list(FAMILIES)[: 3 if args.quick else None]
+    names = args.families or list(FAMILIES)[: 2 if args.quick else None]
     machine = common.machine()
     answers = measure_pairs(args, names)
     rows = {name: common.compare_with_torch(mine) for name, mine in answers.items()}
@@ -143,7 +137,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(common.option(name), type=int, help=values)
     parser.add_argument(
         "--families", nargs="+", choices=FAMILIES, metavar="FAMILY",
-        help="rows of the table, such as 'td3, paper' (the first three if --quick, else all)",
+        help="rows of the table, such as 'td3, paper' (the first two if --quick, else all)",
     )  # fmt: skip
     common.add_core(parser)
 
@@ -154,10 +148,10 @@ def measure_pairs(args: argparse.Namespace, names: list[str]) -> dict[str, commo
     answers = {}
     with common.sides_of(__file__, common.PAIR, **options) as sides:
         for name in names:
-            has_reference = FAMILIES[name].reference is not None
-            mine = sides if has_reference else {"sejax": sides["sejax"]}
+            in_torch = FAMILIES[name].in_torch
+            mine = sides if in_torch else {"sejax": sides["sejax"]}
             weights = sides["sejax"].ask(family=name)["weights"]
-            if has_reference:
+            if in_torch:
                 sides["torch"].ask(family=name, weights=weights)
             requests = [{"family": name, "seed": args.seed + pair} for pair in range(args.pairs)]
             answers[name] = common.in_turns(mine, requests, warm_up=False)
@@ -215,7 +209,7 @@ def torch_side(args: argparse.Namespace) -> None:
     A request with weights makes the SE of them and trains an agent for a few steps.
     """
     import torch
-    from torch_reference import SyntheticEnv
+    from torch_reference import SyntheticEnv, train
 
     torch.set_num_threads(1)
     prepared = {}
@@ -223,17 +217,16 @@ def torch_side(args: argparse.Namespace) -> None:
     def prepare(family: str, weights: Any) -> dict[str, Any]:
         agent, proxy, training = FAMILIES[family].parts(args.steps)
         env = SyntheticEnv(weights, proxy)
-        reference = importlib.import_module(FAMILIES[family].reference or "")
-        prepared[family] = functools.partial(reference.train, env, agent, training)
-        reference.train(env, agent, FAMILIES[family].parts(WARM_UP_STEPS)[2], 0)
+        prepared[family] = functools.partial(train, env, agent, training)
+        train(env, agent, FAMILIES[family].parts(WARM_UP_STEPS)[2], 0)
         return {}
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         if "weights" in request:
             return prepare(request["family"], request["weights"])
-        train, first = prepared[request["family"]], request["seed"] * args.torch_agents
-        seeds = range(first, first + args.torch_agents)
-        results, times = common.measure(lambda: [train(seed) for seed in seeds])
+        first = request["seed"] * args.torch_agents
+        seeds, run = range(first, first + args.torch_agents), prepared[request["family"]]
+        results, times = common.measure(lambda: [run(seed) for seed in seeds])
         return {"steps": sum(result.train_steps for result in results), **times}
 
     common.serve({}, handle)

@@ -2,15 +2,14 @@
 
 Checks first: how far apart a tiny run is on both, whether the compiled program of a
 generation stays on the device and copies no large array, and how many kernels a step launches at
-least. Then figures: agent steps a second with more and more agents in one batch, the paper's DDQN
-beside vectorised PyTorch, generations of CartPole of 144 and of 4,096 candidates, ten thousand
-agents on the shipped SE, HalfCheetah on brax. No figure begins after `--minutes`, or if the one
-before tells that it would not end in time; the table says which are left out.
+least. Then figures: agent steps a second with more and more agents in one batch, generations of
+CartPole of 144 and of 4,096 candidates, ten thousand agents on the shipped SE, HalfCheetah on brax.
+No figure begins after `--minutes`, or if the one before tells that it would not end in time; the
+table says which are left out.
 
-    pip install 'sejax[brax]' torch && python benchmarks/gpu.py --json gpu.json
+    pip install 'sejax[brax]' && python benchmarks/gpu.py --json gpu.json
 
-Measure on an idle machine: PyTorch's threads wait for each other. Without a GPU it measures the
-first device that there is. Seconds are wall-clock of the second call,
+Without a GPU it measures the first device that there is. Seconds are wall-clock of the second call,
 compilation apart. Kernels are counted without a GPU, in the program that is lowered for CUDA: of
 the operations in the body of the training loop, those that XLA cannot fuse into their neighbours.
 """
@@ -57,10 +56,9 @@ class World(NamedTuple):
     proxy: str | None = None
 
 
-OF_THE_PAPER = "the paper's DDQN"
 AGENTS = {
     "quick DDQN": World(("env=cartpole", "agent=ddqn"), "cartpole"),
-    OF_THE_PAPER: World(("env=cartpole", "agent=ddqn", "preset=paper")),
+    "the paper's DDQN": World(("env=cartpole", "agent=ddqn", "preset=paper")),
     "PPO": World(("env=cartpole", "agent=ppo"), "cartpole"),
     "TD3": World(("env=mountain_car_continuous", "agent=td3"), "mountain_car_continuous"),
 }
@@ -235,8 +233,6 @@ def figures(args: argparse.Namespace, device: Any) -> Iterator[tuple[str, Make, 
     for name in agents_of(args):
         for width in widths:
             yield f"{name} trains", on_device(partial(throughput, name, width, steps)), width
-    for width in widths:
-        yield f"{OF_THE_PAPER} in PyTorch", partial(in_torch, device, width, steps), width
     if args.quick:
         return
     for size in (144, 4096):
@@ -260,29 +256,6 @@ def compiled(device: Any, parts: Callable[[], tuple[Callable[..., Any], tuple[An
         return Program(lambda: int(program(*arguments)), {"bytes": sum(sizes)})
 
     return make
-
-
-def in_torch(device: Any, num: int, steps: int) -> Program:
-    """The paper's DDQN in vectorised PyTorch, on an SE as sejax's agents of that name have.
-
-    Raises:
-      RuntimeError: without PyTorch, or if it does not know the device.
-    """
-    try:
-        import torch
-        from torch_reference import SyntheticEnv
-        from torch_vectorised import train
-    except ImportError as error:
-        raise RuntimeError("needs PyTorch: pip install torch") from error
-    where = "cuda" if device.platform == "gpu" else device.platform
-    try:
-        torch.zeros((), device=where)
-    except (AssertionError, RuntimeError) as error:  # such as: not compiled with CUDA enabled
-        raise RuntimeError(str(error)) from error
-    run = configuration.config(AGENTS[OF_THE_PAPER].words)
-    _, params = fresh_se(run)
-    env = SyntheticEnv(jax.device_get(params.weights), run.proxy, where)
-    return Program(partial(train, env, members_of(run)[0].agent, num, steps, where), {})
 
 
 def fresh_se(run: Any) -> tuple[Any, Any]:

@@ -3,8 +3,7 @@
 What a good PyTorch programmer would write for the paper's design, one small network call after the
 other: DDQN on an SE of three networks, then greedy test episodes on the real CartPole. It means
 the same as `sejax.training`, and takes its hyperparameters from the same configurations, which are
-all that it takes from sejax. `torch_nes.py` has the generation,
-`torch_reference_td3.py` and `torch_reference_ppo.py` have other agents.
+all that it takes from sejax. `torch_nes.py` has the generation.
 
 What was tried for speed, in microseconds on one thread of an AVX-512 machine at the paper's
 CartPole settings; first what is used here, alone in a loop (in the whole step, where caches are
@@ -16,7 +15,6 @@ cold, everything takes about 1.3 times as long):
 - optimiser: `torch._fused_adam_` 4; `torch.optim.adam.adam(fused=True)` 21;
   `torch.optim.Adam(fused=True)` 39, over one flat parameter 29, plain 111, `foreach` 107;
 - soft target update: `torch._foreach_lerp_` 3;
-- ReLU in place: a seventh of PPO's learning phase, nothing at a tenth of its rows;
 - SE step: the three networks joined in one with block-diagonal layers 10, as three modules 49;
 - acting: through PyTorch 8; through NumPy on the same memory 3, lost in the noise of the step;
 - storing a transition: through NumPy on the buffer's memory 1, through PyTorch 7.
@@ -30,7 +28,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -41,7 +39,7 @@ from sejax.agents.dqn import DDQNConfig
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
-OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0; Pendulum has the same limit
+OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0
 HEADS = {"state": OBS_DIM, "reward": 1, "done": 1}
 ABSURD = 1e6  # as in sejax.proxies.synthetic
 PRELU_SLOPE = 0.25
@@ -155,13 +153,11 @@ class Step(NamedTuple):
 class SyntheticEnv:
     """The SE: its three networks run as one whose layers hold theirs side by side.
 
-    Actions are indices, made one-hot here, or vectors.
-
     Attributes:
       soft: whether `done` is a number between going on and an end.
     """
 
-    def __init__(self, weights: Weights, config: SyntheticConfig, device: str = "cpu"):
+    def __init__(self, weights: Weights, config: SyntheticConfig):
         heads = [params_from_flax(weights[head]) for head in HEADS]
         self._params = []
         for i in range(config.num_layers + 1):
@@ -171,20 +167,12 @@ class SyntheticEnv:
         self._params.append(torch.full((1,), PRELU_SLOPE))
         self._activation = config.activation
         self.soft = config.done == "soft"
-        self._obs_dim = len(heads[0][-1])
-        self._one_hot = torch.eye(self._params[0].shape[1] - self._obs_dim, device=device)
-        self._params = [x.to(device) for x in self._params]
-
-    def outputs(self, obs: Tensor, action: int | Tensor) -> Tensor:
-        """What the networks give, next state, reward and done: of one observation, or of rows."""
-        is_index = isinstance(action, int) or not action.is_floating_point()
-        vector = self._one_hot[action] if is_index else action
-        return mlp(self._params, torch.cat([vector, obs], dim=-1), self._activation)
+        self._one_hot = torch.eye(NUM_ACTIONS)
 
     @torch.no_grad()
-    def step(self, obs: Tensor, action: int | Tensor) -> Step:
-        """One step from an observation with an action's index or vector."""
-        out = self.outputs(obs, action)
+    def step(self, obs: Tensor, action: int) -> Step:
+        """One step from an observation with an action's index."""
+        out = mlp(self._params, torch.cat([self._one_hot[action], obs]), self._activation)
         values = out.tolist()
         size = max(map(abs, values)) if all(map(math.isfinite, values)) else math.nan
         if not size < ABSURD:
@@ -192,7 +180,7 @@ class SyntheticEnv:
         *_, reward, done = values
         terminated = done > 0.5
         discount = 1 - done if self.soft else 1.0 - terminated
-        return Step(out[: self._obs_dim], reward, discount, terminated, False)
+        return Step(out[:OBS_DIM], reward, discount, terminated, False)
 
 
 class CartPole:
@@ -232,7 +220,7 @@ class Batch(NamedTuple):
 
     obs: Tensor  # [batch, obs_dim]
     next_obs: Tensor  # [batch, obs_dim]
-    action: Tensor  # [batch, 1], int64; [batch, action_dim] of floats where actions are vectors
+    action: Tensor  # [batch, 1], int64
     reward: Tensor  # [batch, 1]
     discount: Tensor  # [batch, 1]
 
@@ -245,44 +233,34 @@ def batch_from_sejax(transition: Any) -> Batch:
         return torch.tensor(np.atleast_2d(array).T.copy())
 
     columns = {name: rows(name) for name in Batch._fields}
-    if transition.action.ndim == 1:
-        columns["action"] = columns["action"].long()
-    return Batch(**columns)
+    return Batch(**columns | {"action": columns["action"].long()})
 
 
 class ReplayBuffer:
-    """A preallocated ring of packed rows, sampled uniformly with replacement.
+    """A preallocated ring of packed rows, sampled uniformly with replacement."""
 
-    Actions are vectors of length `action_dim`, or indices if that is None.
-    """
+    _widths = (OBS_DIM, OBS_DIM, 1, 1, 1)
 
-    def __init__(
-        self, capacity: int, batch_size: int, obs_dim: int = OBS_DIM, action_dim: int | None = None
-    ):
-        self._widths = (obs_dim, obs_dim, action_dim or 1, 1, 1)
+    def __init__(self, capacity: int, batch_size: int):
         self._rows = torch.zeros(capacity, sum(self._widths))
         self._numpy = self._rows.numpy()  # the same memory
         self._index = torch.zeros(batch_size, dtype=torch.int64)
-        self._obs_dim = obs_dim
-        self._actions_are_indices = action_dim is None
         self._num_stored = 0
 
     def store(
-        self, obs: Tensor, next_obs: Tensor, action: int | Tensor, reward: float, discount: float
+        self, obs: Tensor, next_obs: Tensor, action: int, reward: float, discount: float
     ) -> None:
-        row, obs_dim = self._numpy[self._num_stored % len(self._numpy)], self._obs_dim
-        row[:obs_dim] = obs.numpy()
-        row[obs_dim : 2 * obs_dim] = next_obs.numpy()
-        row[2 * obs_dim : -2] = action
-        row[-2], row[-1] = reward, discount
+        row = self._numpy[self._num_stored % len(self._numpy)]
+        row[:OBS_DIM] = obs.numpy()
+        row[OBS_DIM : 2 * OBS_DIM] = next_obs.numpy()
+        row[2 * OBS_DIM :] = action, reward, discount
         self._num_stored += 1
 
     def sample(self) -> Batch:
         self._index.random_(0, min(self._num_stored, len(self._numpy)))
         rows = self._rows.index_select(0, self._index)
         obs, next_obs, action, reward, discount = rows.split(self._widths, dim=1)
-        action = action.long() if self._actions_are_indices else action
-        return Batch(obs, next_obs, action, reward, discount)
+        return Batch(obs, next_obs, action.long(), reward, discount)
 
 
 # --- DDQN -------------------------------------------------------------------------------------
@@ -349,51 +327,6 @@ class TrainResult:
     nonfinite: bool
 
 
-class StepLearner(Protocol):
-    """An agent as `train_for` needs it; it changes in place."""
-
-    def act(self, obs: Tensor) -> int | Tensor:
-        """An action with exploration."""
-
-    def observe(self, obs: Tensor, action: int | Tensor, step: Step, ended: bool) -> None:
-        """Remembers what came of the action, and learns where it is time to."""
-
-    def all_finite(self) -> bool:
-        """Whether all of its parameters are."""
-
-
-def train_for(
-    env: SyntheticEnv,
-    agent: StepLearner,
-    reset: Callable[[], Tensor],
-    num_steps: int,
-    is_over: Callable[[list[float]], bool] = lambda returns: False,
-) -> TrainResult:
-    """Trains an agent on the SE for so many steps; episodes start from `reset()`.
-
-    It ends before if `is_over` says so of the returns of all episodes, after each of them.
-    """
-    obs, total, episode_steps = reset(), 0.0, 0
-    returns: list[float] = []
-    for train_steps in range(1, num_steps + 1):
-        action = agent.act(obs)
-        step = env.step(obs, action)
-        total += step.reward
-        episode_steps += 1
-        ended = step.terminated or episode_steps == MAX_STEPS
-        agent.observe(obs, action, step, ended)
-        obs = step.obs
-        if ended or train_steps == num_steps:
-            returns.append(total)
-            if is_over(returns):
-                break
-            obs, total, episode_steps = reset(), 0.0, 0
-        if step.nonfinite:
-            break
-    nonfinite = step.nonfinite or not agent.all_finite()
-    return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
-
-
 def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int) -> TrainResult:
     """Trains one agent on the SE until the plateau rule fires or its steps or episodes are used up.
 
@@ -408,17 +341,34 @@ def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int
     random.seed(seed)
     rng = np.random.default_rng(seed)
     max_steps = training.max_steps or training.max_episodes * MAX_STEPS
-    return train_for(
-        env,
-        DDQNAgent(hp, max_steps),
-        lambda: torch.from_numpy(CartPole.reset(rng, 1)[0]),
-        max_steps,
-        lambda returns: should_stop(returns, training, hp.warmup_episodes),
-    )
+    agent = DDQNAgent(hp, max_steps)
+
+    def reset() -> Tensor:
+        return torch.from_numpy(CartPole.reset(rng, 1)[0])
+
+    obs, total, episode_steps = reset(), 0.0, 0
+    returns: list[float] = []
+    for train_steps in range(1, max_steps + 1):
+        action = agent.act(obs)
+        step = env.step(obs, action)
+        total += step.reward
+        episode_steps += 1
+        ended = step.terminated or episode_steps == MAX_STEPS
+        agent.observe(obs, action, step, ended)
+        obs = step.obs
+        if ended or train_steps == max_steps:
+            returns.append(total)
+            if should_stop(returns, training, hp.warmup_episodes):
+                break
+            obs, total, episode_steps = reset(), 0.0, 0
+        if step.nonfinite:
+            break
+    nonfinite = step.nonfinite or not agent.state.online.all_finite()
+    return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
 
 
 class DDQNAgent:
-    """What `train_for` takes: acts epsilon-greedily, and learns in each step after the warm-up."""
+    """Acts epsilon-greedily, and learns in each step after the warm-up."""
 
     def __init__(self, config: DDQNConfig, max_steps: int):
         self.state = init_ddqn(config)
@@ -431,14 +381,12 @@ class DDQNAgent:
             return random.randrange(NUM_ACTIONS)
         return greedy_action(self.state, obs, self._config.activation)
 
-    def observe(self, obs: Tensor, action: int | Tensor, step: Step, ended: bool) -> None:
+    def observe(self, obs: Tensor, action: int, step: Step, ended: bool) -> None:
+        """Remembers what came of the action, and learns where it is time to."""
         self._buffer.store(obs, step.obs, action, step.reward, step.discount)
         if self._episode >= self._config.warmup_episodes:
             ddqn_update(self.state, self._buffer.sample(), self._config)
         self._episode += ended
-
-    def all_finite(self) -> bool:
-        return self.state.online.all_finite()
 
 
 def epsilon_at(episode: int, hp: DDQNConfig) -> float:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments import null_baselines
 from experiments.common import curves, figures, tables
 from experiments.common.experiment import Experiment
 from experiments.common.proxy_users import GRID_POINTS, BreakEven, compute, step_grid
@@ -126,8 +127,7 @@ def with_nulls(summary: pd.DataFrame, folder: str) -> pd.DataFrame:
     """The summary with columns of the bandits of `cheapest`; nan where none is known."""
     found = []
     for row in summary.itertuples():
-        path = Path(folder, str(row.task), "summary.csv")
-        stored = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=NULL_COLUMNS)
+        stored = stored_nulls(Path(folder, str(row.task), "rows.csv.xz"))
         mine = stored[(stored["kind"] == row.student_agent) & (stored["hparams"] == "default")]
         own: dict[str, Any] = {}
         for source in NULLS:
@@ -136,6 +136,14 @@ def with_nulls(summary: pd.DataFrame, folder: str) -> pd.DataFrame:
             own[f"{source}_break_even"] = best["real_steps"] / row.tuned_real_steps_mean
         found.append(own)
     return pd.concat([summary, pd.DataFrame(found, index=summary.index)], axis=1)
+
+
+def stored_nulls(path: Path) -> pd.DataFrame:
+    """The summary of `experiments.null_baselines` for a task, by its rows; empty without these."""
+    if not path.exists():
+        return pd.DataFrame(columns=NULL_COLUMNS)
+    settings = null_baselines.NullBaselines.of(env=path.parent.name)
+    return null_baselines.summarise(settings, read_rows(path))
 
 
 def cheapest(bandits: pd.DataFrame, target: Any) -> Any:
@@ -227,7 +235,7 @@ def report(settings: BreakEven, rows: pd.DataFrame) -> pd.DataFrame:
         "seconds: over five groups of agents); never: nothing is saved. Tuned agents are of the "
         "kind of preset=best that pilots of other seeds found fastest; tuned students are these on "
         "the RN. Bandits copy a policy (`experiments.null_baselines`): real steps to make one; "
-        "return of students of the same kind. `summary.csv` has std, intervals and counts."
+        "return of students of the same kind."
     )
     title = "From how many agents on a shipped proxy pays"
     return tables.publish(settings, title, make_table(summary), summary, note)

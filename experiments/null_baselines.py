@@ -338,8 +338,7 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         "Students' hyperparameters are their defaults, or drawn around them (varied). Real steps "
         "are those of making one proxy, tests included; CPU seconds of bandits leave out tests and "
         "compilation. Costs of the best of four are those of all four. A policy by hand took no "
-        "step of the real task; its tests did. `summary.csv` has medians, the worst agent, "
-        "intervals over proxies and counts."
+        "step of the real task; its tests did."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)

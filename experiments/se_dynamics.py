@@ -62,7 +62,15 @@ NOT_BANDIT = {
     ),
     ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
-QUICK = (*runs.QUICK, "agent.hidden_size=32", "agent.batch_size=32")
+# A small proxy and agents that learn enough to be seen moving.
+QUICK = (
+    "es.population_size=12",
+    "es.num_incumbent_evals=6",
+    "training.max_steps=1000",
+    "proxy.hidden_size=32",
+    "agent.hidden_size=32",
+    "agent.batch_size=32",
+)
 
 
 @dataclass(frozen=True, kw_only=True)

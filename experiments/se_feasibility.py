@@ -149,7 +149,7 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
         f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
         f"{config.training.test_episodes} test episodes each; the "
         f"first passage is the first that reaches {solved_reward:g}, which does not say that fresh "
-        "agents solve the task on that SE (se_out_of_sample). Median and range over runs; one "
+        "agents solve the task on that SE. Median and range over runs; one "
         "without a first passage took longer than all. The last incumbent mean: over runs. "
         f"{tables.interval_note('runs')} The best is a maximum of noisy means and hence too high: "
         f"se_performance tests the stored SEs with other agents.{tables.WORST_NOTE}"

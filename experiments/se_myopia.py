@@ -48,8 +48,6 @@ from sejax.proxies import header
 STORED = (  # below results/
     "soft_ses/*.safetensors",
     "se_feasibility/*/ses.safetensors",
-    "se_horizons/*/*.safetensors",
-    "se_families/*/*.safetensors",
 )
 DISCOUNTS = (0.0, 0.5, 0.9, 0.99)
 UNTRAINED = "untrained"

@@ -8,14 +8,10 @@ On each SE of a set `num_agents` agents are trained whose hyperparameters are dr
 whatever the SEs were learned with; `varied` and `fixed` are sets from se_feasibility, learned with
 `agent_hparams=varied` and without. SEs that did not reach the task's threshold are left out,
 as in the authors' code, which stores no others. As many groups of agents are trained on the real
-task, or `real_groups`.
-
-The paper's agents were not tuned for few steps on the real task. With `tuned=true` agents that were
-are trained there as well, with the fixed settings of `preset=best` (docs/agents.md) and targets
-that go on at the time limit: what an SE saves is to be measured against these too.
+task, or `real_groups`. These agents were not tuned for few steps there: those that were are in
+`experiments.break_even`.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,19 +24,17 @@ import pandas as pd
 import sejax
 from experiments.common import agents as groups
 from experiments.common import figures, tables
-from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
+from experiments.common.agents import Condition, SeAgents, return_columns
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, envs
-from sejax.options import one_of, require, shortened
-from sejax.training import SOLVED_BY, TrainingConfig
+from sejax.options import require, shortened
+from sejax.training import TrainingConfig
 
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
-ON_REAL = ("real", "tuned")
 SHOWN = {
     "real": (figures.REAL, "real"),
-    "tuned": (figures.TUNED, "real, tuned agent"),
     "varied": (figures.VARIED, "synth., HPs varied"),
     "fixed": (figures.FIXED, "synth., HPs fixed"),
     "best": (figures.BEST, "synth., best SEs"),
@@ -79,14 +73,10 @@ class SePerformance(SeAgents):
     varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
     fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
     env: str | None = setting(None)  # task, where no file is given; cartpole
-    tuned: bool = setting(True, quick=False)  # whether tuned agents train on the real task too
-    real_groups: int | None = count(
-        None
-    )  # of agents on the real task, which is slow; as many as SEs
+    # Groups of agents on the real task, which is slow; as many as SEs.
+    real_groups: int | None = count(None)
     # On the real task; 1000 (discrete TD3 in Acrobot 500).
     real_episodes: int | None = count(None, quick=100)
-    # Whose last returns end training on the real task; train, as in the paper's code.
-    solved_by: str = setting("train", one_of(SOLVED_BY))
 
 
 def compute(settings: SePerformance) -> pd.DataFrame:
@@ -98,8 +88,6 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     parts = []
     for kind in settings.agents:
         conditions = {"real": on_real(settings, task, sets, kind)}
-        if settings.tuned:
-            conditions["tuned"] = on_real_tuned(settings, conditions["real"], kind)
         conditions |= {name: groups.on_ses(settings, ses, kind) for name, ses in sets.items()}
         parts += [
             groups.train_kind(settings, condition).assign(kind=kind, setting=name)
@@ -155,23 +143,12 @@ def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str
         stop_rule="solved",
         time_limit_is_terminal=True,
         max_steps=settings.max_steps,
-        solved_by=settings.solved_by,
+        solved_by="train",  # as in the paper's code
         test_episodes=settings.test_episodes,
     )
     names = [f"real-{index:02d}" for index in range(settings.real_groups or as_ses)]
     agent = groups.agent_config(settings, kind)
     return Condition.real(task, names, name=kind, agent=agent, training=training, hparams="varied")
-
-
-def on_real_tuned(settings: SePerformance, real: Condition, kind: str) -> Condition:
-    """The real task for agents of the settings that were found there, not drawn."""
-    return dataclasses.replace(
-        real,
-        name=f"{kind}-tuned",
-        hparams="default",
-        agent=real.agent if settings.quick else tuned_agent(real.task.name, kind),
-        training=dataclasses.replace(real.training, time_limit_is_terminal=False),
-    )
 
 
 def select_best(agents: pd.DataFrame, count: int = NUM_BEST) -> pd.DataFrame:
@@ -190,7 +167,7 @@ def select_best(agents: pd.DataFrame, count: int = NUM_BEST) -> pd.DataFrame:
 
 def with_best(agents: pd.DataFrame) -> pd.DataFrame:
     """Adds the best SEs of all sets for discrete TD3 as a setting, where there are several SEs."""
-    on_ses = agents[(agents["kind"] == BEST_FOR) & ~agents["setting"].isin(ON_REAL)]
+    on_ses = agents[(agents["kind"] == BEST_FOR) & (agents["setting"] != "real")]
     best = select_best(on_ses) if len(on_ses) else on_ses
     return pd.concat([agents, best.assign(setting="best")], ignore_index=True)
 
@@ -204,7 +181,8 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
-        ses = strata(mine, mine["setting"].iloc[0])
+        is_real = mine["setting"].iloc[0] == "real"
+        ses = None if is_real else mine["group"]
         row = {"num_ses": mine["group"].nunique(), "num_agents": len(mine)}
         row |= {"num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
@@ -216,19 +194,14 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     return tables.summary_by(agents, ["kind", "setting"], statistics)
 
 
-def strata(agents: pd.DataFrame, name: str) -> pd.Series | None:
-    """Labels of the SEs that agents are drawn within; groups on the real task share it."""
-    return None if name in ON_REAL else agents["group"]
-
-
 def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    steps = summary.set_index(["setting", "kind"])["train_steps_mean"]
+    steps = summary[summary["setting"] == "real"].set_index("kind")["train_steps_mean"]
 
-    def fewer(row: Any, than: str) -> str:
-        if row.setting in ON_REAL[: ON_REAL.index(than) + 1] or (than, row.kind) not in steps:
+    def fewer(row: Any) -> str:
+        if row.setting == "real" or row.kind not in steps:
             return ""
-        return f"{1 - row.train_steps_mean / steps[than, row.kind]:.0%}"
+        return f"{1 - row.train_steps_mean / steps[row.kind]:.0%}"
 
     def paper(numbers: Mapping[Any, Mapping[str, str]]) -> Callable[[Any], str]:
         return lambda row: numbers.get((env_name, row.kind), {}).get(row.setting, "")
@@ -239,21 +212,18 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "SEs, agents": "{num_ses}, {num_agents}",
         "interval over": lambda row: (
             tables.drawn_text(row.num_agents, "agents")
-            if row.setting in ON_REAL
+            if row.setting == "real"
             else tables.drawn_text(row.num_ses, "SEs")
         ),
         "training steps": tables.mean_text("train_steps", 0, std=True),
         "paper's": paper(PAPER_STEPS),
-        "fewer": lambda row: fewer(row, "real"),
-        "than tuned": lambda row: fewer(row, "tuned"),
+        "fewer": fewer,
         "episodes": tables.mean_text("train_episodes", 1, std=True),
         "return": tables.mean_text("test_return", 1, std=True),
         "worst tenth": "{test_return_worst_tenth:.1f}",
         "solved": "{solved:.0%}",
         "paper's return": paper(PAPER_RETURNS),
     }
-    if "tuned" not in set(summary["setting"]):
-        del columns["than tuned"]
     return tables.as_texts(summary, columns)
 
 
@@ -262,7 +232,6 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     agents = with_best(rows)
     summary = summarise(agents, task.solved_reward)
     draw(task, agents, settings.folder / "performance.png")
-    draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
         f"episodes each. {tables.interval_note('what its column names')} "
@@ -309,25 +278,6 @@ def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
         texts = [f"train: {SHOWN[name][1]}" for name in longest]
         columns = len(longest) if len(kinds) > 1 else 1  # labels are as wide as two panels
         figure.legend(handles, texts, ncols=columns, loc="outside upper center")
-
-
-def draw_profiles(task: Task, agents: pd.DataFrame, path: Path) -> None:
-    """Draws performance profiles of the agents' mean test returns, a panel for each kind."""
-    kinds = list(agents.groupby("kind", sort=False))
-    low, high = agents["test_return"].min(), agents["test_return"].max()
-    size = (1.2 + 3.6 * len(kinds), 3.6)
-    with figures.panels(path, 1, len(kinds), size, sharey=True) as (figure, axes):
-        for axis, (kind, of_kind) in zip(axes[0], kinds, strict=True):
-            for name, mine in of_kind.groupby("setting", sort=False):
-                color, label = SHOWN[str(name)]
-                labels = mine.index if name in ON_REAL else mine["group"]
-                runs = [each for _, each in mine["test_return"].groupby(labels)]
-                figures.profile(axis, runs, low, high, color, f"train: {label}")
-            axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
-            title, label = figures.AGENT_NAMES.get(str(kind), kind), "return of an agent on"
-            axis.set(title=title, xlabel=f"{label} {task.name}")
-        axes[0, 0].set_ylabel("share of agents with more")
-        figures.legend_above(figure, max(axes[0], key=lambda axis: len(axis.lines)), 2)
 
 
 def colored(agents: pd.DataFrame, names: str | list[str]) -> list[tuple[str, np.ndarray]]:

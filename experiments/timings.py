@@ -20,7 +20,6 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import figures
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
 from sejax.cli import session
@@ -112,7 +111,6 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
 
 
 def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
-    draw(settings, timed)
     cores = int(timed["cores"].iloc[0])
     columns: dict[str, Any] = {
         "task": lambda row: ROWS[row.row].env,
@@ -137,28 +135,6 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
 
 def _digits(seconds: float) -> str:
     return ",.0f" if seconds >= 10 else ".2g"
-
-
-def draw(settings: Timings, timed: pd.DataFrame) -> None:
-    """Draws the seconds of each row beside the paper's."""
-    rows, cores = [ROWS[name] for name in timed["row"]], int(timed["cores"].iloc[0])
-    names = [
-        f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
-        for row, preset in zip(rows, timed["preset"], strict=True)
-    ]
-    bars = {f"sejax, {cores} cores": (0.19, timed["seconds"], figures.REAL)}
-    if not settings.quick:  # whose trainings are much shorter
-        papers = [row.seconds for row in rows]
-        bars = {f"paper, {PAPER_CORES} cores": (-0.19, papers, figures.VARIED)} | bars
-    places, path = np.arange(len(names)), settings.folder / "timings.png"
-    with figures.panels(path, 1, 1, (7, 0.9 + 0.55 * len(names))) as (figure, axes):
-        axis = axes[0, 0]
-        for label, (shift, seconds, color) in bars.items():
-            axis.barh(places + shift, seconds, 0.36, color=color, label=label)
-        axis.set(xscale="log", xlabel="seconds for an outer iteration")
-        axis.set_yticks(places, names, fontsize=8)
-        axis.invert_yaxis()
-        figures.legend_above(figure, axis, 2)
 
 
 EXPERIMENT = Experiment(settings=Timings, compute=compute, report=report, about=__doc__)

@@ -58,7 +58,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
     assert list(rns.seeds) == [3, 4, 5]
 
     # The best two of three, by the scores of the runs' incumbents.
-    curve = shards.read_rows(folder / "additive_potential.csv.xz")
+    curve = shards.read_rows(folder / "curves.csv.xz")
     np.testing.assert_allclose(rns.scores, curve["incumbent_mean"], rtol=1e-6)
     best = rns.ranked(2)
     assert list(best.scores) == sorted(rns.scores)[:0:-1]
@@ -124,7 +124,7 @@ def test_objectives_are_compared_with_the_best_and_the_worst(options):
     table = rn_objectives.EXPERIMENT.run(settings)
     # The real task twice, and for each objective and choice two variants.
     assert len(table) == 2 + 2 * 2 * 2
-    summary = pd.read_csv(settings.folder / "summary.csv")
+    summary = pd.read_csv(settings.summary_file)
     real = summary[summary["world"] == "real"]
     assert real["return_mean"].nunique() == 1  # the same agents beside each objective
     best, worst = (
@@ -138,7 +138,7 @@ def test_the_heat_map_shows_what_the_rns_pay(options):
     settings = options(RnHeatmap, RNS)
     table = rn_heatmap.EXPERIMENT.run(settings)
     assert list(table["variant"]) == list(settings.variants)
-    summary = pd.read_csv(settings.folder / "summary.csv").set_index(["variant", "move"])
+    summary = pd.read_csv(settings.summary_file).set_index(["variant", "move"])
     # 11 moves into the cliff cost 100 and only the additive RNs pay the real reward as well.
     assert summary.loc[("additive_potential", "into the cliff"), "mean"] < -90
     assert summary.loc[("exclusive_non_potential", "into the cliff"), "mean"] > -10

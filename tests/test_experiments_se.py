@@ -1,26 +1,17 @@
 """The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
 import dataclasses
-import itertools
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from support import paper_training, refuse
+from support import paper_training
 from test_experiments import TINY, TINY_AGENT, save_ses
 
 import sejax
-from experiments import (
-    se_families,
-    se_feasibility,
-    se_horizons,
-    se_models,
-    se_out_of_sample,
-    se_performance,
-)
+from experiments import se_feasibility, se_models, se_performance
 from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import (
     mean_interval,
@@ -148,27 +139,6 @@ def test_intervals_are_over_ses_and_not_agents_but_on_the_real_task():
     assert "[" not in se_performance.make_table("cartpole", few)["return"][0]
 
 
-def test_a_tuned_agent_is_a_baseline_of_its_own():
-    settings = se_performance.SePerformance.of(max_steps=700, real_groups=2)
-    task = envs.make("cartpole")
-    real = se_performance.on_real(settings, task, {}, "ddqn")
-    tuned = se_performance.on_real_tuned(settings, real, "ddqn")
-    assert (real.hparams, tuned.hparams) == ("varied", "default")
-    assert (real.agent.hidden_size, tuned.agent.hidden_size) == (128, 64)
-    assert real.training.time_limit_is_terminal and not tuned.training.time_limit_is_terminal
-    assert tuned.training.max_steps == 700
-    assert [group.name for group in tuned.groups] == ["real-00", "real-01"]
-
-    steps = {"real": 1000.0, "tuned": 400.0, "fixed": 100.0}
-    agents = pd.concat(
-        made_up_agents().assign(kind="ddqn", setting=name, train_steps=value)
-        for name, value in steps.items()
-    )
-    table = se_performance.make_table("cartpole", se_performance.summarise(agents, 195))
-    assert table["fewer"].tolist() == ["", "60%", "90%"]
-    assert table["than tuned"].tolist() == ["", "", "75%"]
-
-
 def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
     agents = made_up_agents()
     agents.loc[(agents["group"] == "se0") & (agents["agent"] % 2 == 1), "test_return"] = 999
@@ -269,177 +239,3 @@ def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
         with pytest.raises(ConfigError) as refused:
             run("se_performance", se_performance, tmp_path, **given)
         assert refused.value.field == field
-
-
-# --- out of sample --------------------------------------------------------------------------------
-
-
-def test_an_se_is_solved_where_its_fresh_agents_are_and_intervals_draw_ses():
-    returns = {"a": [200, 190], "b": [200, 180], "c": [195, 195], "d": [150, 0], "e": [200, 200]}
-    agents = pd.DataFrame([
-        {"kind": "ppo", "hparams": "default", "trained_on": name, "steps": 2000, "group": group,
-         "agent": i, "test_return": float(x)}
-        for name in ("fixed", "real") for group, pair in returns.items()
-        for i, x in enumerate(pair)
-    ])  # fmt: skip
-    summary = se_out_of_sample.summarise(agents, 195).set_index("trained_on")
-    ses, real = summary.loc["fixed"], summary.loc["real"]
-    assert (ses["groups_solved"], ses["num_groups"], ses["num_agents"]) == (3, 5, 10)  # a, c, e
-    assert ses["solved"] == 0.6 and ses["worst_tenth"] == ses["worst"] == 0
-    ends = ses["test_return_low"], ses["test_return_high"]
-    assert ends == pytest.approx(mean_interval([195, 190, 195, 75, 200]))
-    ends = real["test_return_low"], real["test_return_high"]
-    assert ends == pytest.approx(mean_interval(agents["test_return"][:10]))
-    table = se_out_of_sample.make_table(summary.reset_index())
-    assert table["interval over"].tolist() == ["5 SEs", "10 agents"]
-    assert table["SEs or tables solved"].tolist() == ["3 of 5", ""]
-
-
-def test_fresh_agents_train_on_all_ses_and_beside_them_as_long(ses):
-    settings = se_out_of_sample.SeOutOfSample.of(fixed=ses, real_agents=4, more_steps=[90])
-    assert settings.seed == 1000, "seeds that took no part in tuning"
-    sets = se_out_of_sample.load_sets(settings)
-    found = list(se_out_of_sample.conditions(settings, sets, "ddqn", "default"))
-    names = [condition.groups[0].name.partition("-")[0] for condition, _ in found]
-    assert names == ["fixed", "hand", "real", "real"]
-    assert [condition.training.max_steps for condition, _ in found] == [41, 41, 41, 90]
-    counts = [len(condition.groups) * num_agents for condition, num_agents in found]
-    assert counts == [3 * 10, 4, 4, 4], "unsolved SEs are not left out"
-    assert not found[-1][0].training.time_limit_is_terminal
-
-
-def test_ses_of_another_task_are_refused(ses):
-    settings = se_out_of_sample.SeOutOfSample.of(env="acrobot", fixed=ses)
-    with pytest.raises(ConfigError, match="env=cartpole"):
-        se_out_of_sample.load_sets(settings)
-
-
-# --- mixtures and horizons ------------------------------------------------------------------------
-
-
-def config_with(names, others=(), **given):
-    settings = se_families.SeFamilies.of(quick=True, **given)
-    return settings.config_with(names, others)
-
-
-def test_words_on_a_family_reach_the_sets_that_have_it():
-    run = ["agents.ppo.epochs=3", "es.noise_std=0.5"]
-    both = config_with(["ddqn", "ppo"], ["ddqn", "ppo"], run=run)
-    assert [(x.key, x.weight) for x in both.agents.members] == [("ddqn", 1), ("ppo", 1)]
-    assert both.agents.members[1].agent.epochs == 3 and both.es.noise_std == 0.5
-    alone = config_with(["ddqn"], ["ddqn", "ppo"], run=run)
-    assert [x.key for x in alone.agents.members] == ["ddqn"] and alone.es.noise_std == 0.5
-    with pytest.raises(ConfigError, match="agents"):
-        config_with(["ddqn"], ["ddqn"], run=["agents.ppo.epochs=3"])
-    assert config_with(["ddqn"], cpu_budget_s=5.0).generations == runs.UNLIMITED
-    assert config_with(["ddqn"], cpu_budget_s=5.0, generations=7).generations == 7
-
-
-def agents_tested(means):
-    """Two agents on each of two SEs; `means` by (set, tested family), SEs 10 apart."""
-    return pd.DataFrame([
-        {"learned_with": name, "kind": kind, "hparams": "default", "seed": seed, "agent": agent,
-         "test_return": mean + 10 * (seed - 0.5) + 2 * (agent - 0.5)}
-        for (name, kind), mean in means.items() for seed in (0, 1) for agent in (0, 1)
-    ])  # fmt: skip
-
-
-MEANS = {("ddqn", "ddqn"): 100.0, ("ddqn", "ppo"): 20.0, ("ddqn+ppo", "ddqn"): 90.0,
-         ("ddqn+ppo", "ppo"): 80.0}  # fmt: skip
-
-
-def test_the_matrix_has_means_costs_and_marks_families_that_took_no_part():
-    curves = pd.DataFrame([
-        {"learned_with": name, "seed": seed, "generation": g, "cpu_s": cost,
-         "incumbent_mean": 50.0 + 30 * g * seed, "env_steps_total": 100 * (g + 1)}
-        for name, cost in (("ddqn", 1.0), ("ddqn+ppo", 2.5)) for seed in (0, 1) for g in range(3)
-    ])  # fmt: skip
-    summary = se_families.summarise(curves, agents_tested(MEANS), solved_reward=96.0)
-    row = summary.iloc[0]  # returns 94, 96, 104, 106
-    assert (row["test_return_mean"], row["solved"], row["num_ses"]) == (100, 0.75, 2)
-    assert np.isnan(row["test_return_low"])  # of two SEs
-    assert row["test_return_worst_tenth"] == 94
-    assert summary["took_part"].tolist() == [True, False, True, True]
-    assert summary["cpu_s"].tolist() == [3, 3, 7.5, 7.5]
-    assert summary["solved_runs"].tolist() == [0.5] * 4 and summary["env_steps"].eq(300).all()
-    table = se_families.make_table(summary)
-    assert table["learned with"].tolist() == ["DDQN", "DDQN + PPO"]
-    assert [text.endswith(se_families.LEFT_OUT) for text in table["PPO"]] == [True, False]
-    assert table["DDQN"][0] == "100.0; worst tenth 94.0; 75%"
-    with_ends = summary.assign(test_return_low=95.0, test_return_high=105.0)
-    assert se_families.make_table(with_ends)["DDQN"][0].startswith("100.0 [95.0, 105.0]; worst")
-
-
-@pytest.mark.slow
-def test_a_run_ends_with_its_budget_and_goes_on_with_a_larger_one(tmp_path, monkeypatch):
-    ticks = itertools.count()  # a clock that is a second later at each look
-    monkeypatch.setattr(runs, "time", SimpleNamespace(process_time=lambda: float(next(ticks))))
-
-    def costs(budget):
-        given = {"cpu_budget_s": budget, "generations": 4}
-        run("se_horizons", se_horizons, tmp_path, **given)
-        rows = shards.read_rows(tmp_path / "rows.csv.xz")
-        return shards.unstack(rows, "curves")["cpu_s"].tolist()
-
-    assert costs(1.5) == [1, 1]  # the second began before 1.5 s were spent
-    assert costs(100.0) == [1, 1, 1, 1]  # `generations` ends it
-
-
-def test_an_unknown_family_is_refused_before_anything_is_learned(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "learn", refuse)
-    for given in ({"sets": "ddqn+pppo"}, {"tested": "pppo"}, {"run": ["agents.ddqn.x=1"]}):
-        options = {"sets": "ddqn", "tested": "ddqn", "out": str(tmp_path)} | given
-        with pytest.raises(ConfigError, match=r"^agents must be one of|agents\.ddqn\.x"):
-            se_families.EXPERIMENT.run(se_families.SeFamilies.of(**options))
-
-
-def test_kinds_of_ses_are_told_by_what_they_override():
-    settings = se_horizons.SeHorizons.of(horizons=[1, 5, None], ends=["threshold", "sigmoid"])
-    assert len(settings.kinds) == 2 * (1 + 2 * 2)
-    named = {kind.name: kind.words for kind in settings.kinds}
-    assert named["1-learned"] == ["proxy.horizon=1", "proxy.initial_state=learned"]
-    assert named["limit-real-sigmoid"] == [
-        "proxy.horizon=null", "proxy.initial_state=real", "proxy.done=sigmoid"]  # fmt: skip
-    assert "'horizons=[1,5,null]'" in settings.command()
-
-
-def horizon_rows():
-    """Two kinds with two runs of four generations of 2 CPU s each."""
-    incumbents = {("1", "real", "-"): ([10, 196, 100, 197], [0, 1, 2, 199]),
-                  ("limit", "real", "threshold"): ([5, 5, 5, 300], [5, 5, 5, 5])}  # fmt: skip
-    curves = pd.DataFrame([
-        {"horizon": horizon, "starts": starts, "end": end, "seed": seed, "generation": g,
-         "incumbent_mean": float(score), "cpu_s": 2.0, "train_steps_mean": 30.0,
-         "env_steps_total": 100 * (g + 1)}
-        for (horizon, starts, end), runs in incumbents.items() for seed, scores in enumerate(runs)
-        for g, score in enumerate(scores)
-    ])  # fmt: skip
-    transfer = pd.DataFrame([
-        {"horizon": "1", "starts": "real", "end": "-", "kind": "ppo", "test_return_mean": 180.0},
-        {"horizon": "limit", "starts": "real", "end": "threshold", "kind": "ppo",
-         "test_return_mean": 20.0},
-    ])  # fmt: skip
-    return curves, transfer.assign(hparams="default")
-
-
-def test_runs_are_compared_within_equal_cpu_seconds():
-    curves, transfer = horizon_rows()
-    each = se_horizons.summarise_runs(curves, 5.0, solved_reward=195)
-    assert each["generations"].tolist() == [3] * 4  # begun at 0, 2 and 4 s
-    assert each["best"].tolist() == [196, 2, 5, 5]
-    assert each["to_solve"].tolist() == each["cpu_s_to_solve"].div(2).tolist()
-    assert each["cpu_s_to_solve"].tolist() == [4, np.inf, np.inf, np.inf]
-    assert each["stays_solved"][0] == 0 and each["stays_solved"][1:].isna().all()
-    whole = se_horizons.summarise_runs(curves, None, solved_reward=195)
-    assert whole["stays_solved"][0] == 0.5 and whole["best"].tolist() == [197, 199, 300, 5]
-    assert np.isnan(whole["stays_solved"][1])  # no later generation
-
-    summary = se_horizons.summarise(each, transfer)
-    assert summary["best_mean"].tolist() == [99, 5] and summary["on_ppo"].tolist() == [180, 20]
-    assert summary["best_low"].isna().all()  # of two runs
-    table = se_horizons.make_table(summary)
-    assert table["runs solved"].tolist() == ["1 of 2", "0 of 2"]
-    assert table["CPU s to solve"].tolist() == ["-", "-"]
-    assert table["stay solved"].tolist() == ["0%", "-"]
-    text = se_horizons.differences(each, summary, "threshold")
-    assert text == "1-real less limit-real-threshold: +94.0"

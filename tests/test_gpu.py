@@ -27,9 +27,7 @@ def test_the_command_measures_and_writes_its_result(tmp_path):
     assert result["checks"] == {
         "largest_difference_of_weights": 0.0, "visits_of_the_host": 0, "copies_of_large_arrays": 0
     }  # fmt: skip
-    row, in_torch = result["figures"]
-    assert in_torch["what"] == "the paper's DDQN in PyTorch"
-    assert in_torch.get("steps", 16 * 64) == 16 * 64
+    (row,) = result["figures"]
     assert row["agents"] == 16 and row["steps"] == 16 * 64 and row["steps_per_s"] > 0
     assert 10 < result["kernels"]["quick DDQN"]["a_step"] < 100
     assert "Kernels of an agent step" in said

@@ -134,8 +134,7 @@ def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
     folder = tmp_path / "results" / "se_myopia" / "cartpole"
     folder.mkdir(parents=True)
     monkeypatch.setattr(make_zoo, "ROOT", tmp_path)
-    summary = pd.DataFrame({"set": ["cartpole (shipped)"], "verdict": ["dynamics"]})
-    summary.to_csv(folder / "summary.csv", index=False)
+    (folder / "table.md").write_text("| SEs | verdict |\n| cartpole (shipped) | 9 | dynamics |\n")
     tested = {sejax.load_proxy("cartpole").fingerprint: {"cartpole": "dynamics"}, "another": {}}
     for fingerprint, expected in tested.items():
         rows = pd.DataFrame({"set": ["cartpole (shipped)", None], "group": [fingerprint, "x"]})

@@ -8,22 +8,9 @@ import scipy.stats
 from experiments.common.statistics import (
     difference_interval,
     mean_interval,
-    performance_profile,
     worst_tenth,
 )
 from experiments.common.tables import mean_columns
-
-
-def test_a_profile_is_of_all_runs_and_its_interval_of_the_groups():
-    """Five groups; above 1 are shares of 1, 1/2, 1/2, 0 and 1/2: t of 4 is 2.7764, std 0.3536."""
-    groups = [2.0, 3.0], [1.0, 2.0], [0.0, 5.0], [1.0, 1.0], [9.0, 0.5]
-    shares, low, high = performance_profile(groups, [1, -1, 9])
-    np.testing.assert_allclose(shares, [0.5, 1, 0])
-    np.testing.assert_allclose([low[0], high[0]], [0.5 - 0.43900, 0.5 + 0.43900], atol=1e-4)
-    np.testing.assert_array_equal([low[1:], high[1:]], [[1, 0]] * 2)
-    assert np.isnan(performance_profile(groups[:4], [1])[1]).all(), "of four groups none"
-    _, low, high = performance_profile([[0.0], [0.0], [0.0], [0.0], [2.0]], [1])
-    assert low == 0 and high < 1, "within what a share can be"
 
 
 @pytest.mark.parametrize("size", [5, 6, 10, 33])
@@ -81,5 +68,3 @@ def test_the_worst_tenth_is_the_mean_of_the_lowest_values():
 def test_equal_runs_have_no_uncertainty():
     assert mean_interval([3.0] * 5) == (3.0, 3.0)
     assert difference_interval([3.0] * 5, [1.0] * 6) == (2.0, 2.0)
-    profile = performance_profile([[3.0]] * 5, [2.9, 3.0])
-    np.testing.assert_array_equal(profile, [[1, 0]] * 3)  # above is more than

@@ -1,6 +1,5 @@
 """Trackers: what they hear, where they go on, and that one that fails is dropped."""
 
-import json
 import struct
 import types
 
@@ -135,22 +134,6 @@ def test_wandb_keeps_a_run_offline_and_goes_on_with_it(tmp_path, monkeypatch):
     sessions = sorted((tmp_path / "wandb").glob("offline-run-*-0123abcd/*.wandb"))
     assert len(sessions) in (1, 2)  # one folder for each, named by the second
     assert b"population_scores" in sessions[0].read_bytes()
-
-
-@pytest.mark.filterwarnings("default")
-def test_trackio_keeps_one_run_on_this_machine(tmp_path, monkeypatch):
-    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
-    pytest.importorskip("trackio", reason="pip install 'sejax[trackio]'")
-    import sqlite3
-
-    track(tmp_path, trackers.TrackioConfig())
-    with sqlite3.connect(tmp_path / "trackio" / "sejax.db") as database:
-        rows = database.execute("select step, run_name, metrics from metrics").fetchall()
-    assert len({name for _, name, _ in rows}) == 1
-    told = [(step, json.loads(metrics)) for step, _, metrics in rows]
-    steps = {step: values for step, values in told if "incumbent_mean" in values}
-    assert sorted(steps) == [0, 1, 2] and steps[2]["incumbent_mean"] == 2.5
-    assert steps[0]["population_scores"]["_type"] == "trackio.histogram"
 
 
 def test_the_picture_takes_no_step_that_a_run_which_goes_on_will_log(tmp_path):

@@ -8,6 +8,7 @@
 """
 
 import functools
+import io
 import re
 import string
 import subprocess
@@ -52,27 +53,6 @@ class WrongError(ValueError):
     """A claim or table that its rows do not give."""
 
 
-def frame_of(root: Path, rows: str) -> Any:
-    """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, or settings."""
-    if rows.startswith("settings "):
-        return sejax.config(rows.split()[1:])
-    if rows == "pretrained":
-        return pd.DataFrame(
-            [
-                vars(proxy) | (vars(proxy.learning) if proxy.learning else {}) | vars(each)
-                for proxy in zoo.pretrained()
-                for each in proxy.evaluations
-            ]
-        )
-    if "*" in rows:
-        found = sorted(root.glob(rows))
-        return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
-    path = root / rows
-    if not path.exists():
-        raise WrongError(f"there are no rows {rows}")
-    return yaml.safe_load(path.read_text()) if path.suffix == ".json" else read_rows(path)
-
-
 @dataclass(frozen=True)
 class Claims:
     """The entries of `docs/claims.yaml`, and the documents of the project in a folder."""
@@ -86,10 +66,49 @@ class Claims:
 
     # --- what the rows give ----------------------------------------------------------------------
 
+    @functools.cached_property
+    def remade(self) -> list[remake.Remade]:
+        """The tables of `results/`, and the numbers behind them."""
+        return remake.remake(self.root)
+
+    @functools.cached_property
+    def summaries(self) -> dict[Path, str]:
+        """The numbers behind each table, by the file that they would be."""
+        return {
+            each.path.with_name(each.path.name.replace("table.md", "summary.csv")): each.summary
+            for each in self.remade
+        }
+
+    def frame(self, rows: str) -> Any:
+        """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, settings."""
+        if rows.startswith("settings "):
+            return sejax.config(rows.split()[1:])
+        if rows == "pretrained":
+            return pd.DataFrame(
+                [
+                    vars(proxy) | (vars(proxy.learning) if proxy.learning else {}) | vars(each)
+                    for proxy in zoo.pretrained()
+                    for each in proxy.evaluations
+                ]
+            )
+        if "*" in rows:
+            found = sorted(self.root.glob(rows))
+            return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
+        rows, _, variant = rows.partition("#")
+        path = self.root.resolve() / rows
+        if path.name.endswith("summary.csv") and path in self.summaries:
+            return pd.read_csv(io.StringIO(self.summaries[path]))
+        if not path.exists():
+            raise WrongError(f"there are no rows {rows}")
+        if path.suffix == ".json":
+            return yaml.safe_load(path.read_text())
+        found = read_rows(path)
+        return found[found["variant"] == variant] if variant else found
+
     def selected(self, entry: Mapping[str, Any]) -> dict[str, Any]:
         """The frames of an entry by name; one file is `rows`."""
         names = entry["rows"] if isinstance(entry["rows"], dict) else {"rows": entry["rows"]}
-        frames = {name: frame_of(self.root, rows) for name, rows in names.items()}
+        frames = {name: self.frame(rows) for name, rows in names.items()}
         if "where" in entry:
             frames["rows"] = frames["rows"].query(entry["where"])
         return frames
@@ -159,7 +178,7 @@ class Claims:
 
     def check(self) -> Iterator[str]:
         """What is wrong, a message each."""
-        yield from remake.check(self.root, tuple(self.entries["without_rows"]))
+        yield from remake.check(self.root, self.remade)
         documents, covering = self.documents(), []
         for name, text in documents.items():
             for found in TABLE.finditer(text):
@@ -206,7 +225,7 @@ class Claims:
 
     def write(self) -> None:
         """Puts what the rows give into the tables of `results/` and all documents."""
-        remake.write(self.root, tuple(self.entries["without_rows"]))
+        remake.write(self.remade)
         claims = [(entry, self.values(entry)) for entry in self.entries.get("claims", {}).values()]
         for name, text in self.documents().items():
             new = self.with_tables(text)
@@ -232,6 +251,7 @@ class Claims:
 
         Rows are written again when columns move, settings when their format does.
         """
+        rows = rows.partition("#")[0].replace("summary.csv", "rows.csv.xz")
         paths = [{"pretrained": "sejax/pretrained"}.get(rows, rows)]
         paths += [str(path) for path in (self.root / rows).parent.glob("settings.json*")]
         git = ["git", "-C", str(self.root), "log", "-1", "--format=%ct %h %cs", "--"]

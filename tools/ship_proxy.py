@@ -74,7 +74,7 @@ def save(path: Path, proxy: sejax.Proxy, **more: object) -> None:
 
 def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
     """What is known of a proxy's run, as a part of its record."""
-    curves = path.with_suffix(".csv.xz")
+    curves = path.with_name("curves.csv.xz")
     if path.is_dir():
         ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
         config = yaml.safe_load((path / "config.yaml").read_text())
@@ -84,7 +84,8 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
         own = {"seed": proxy.record["seed"], "num_seeds": 1}
         config = json.loads(json.dumps(configuration.plain(learned))) | own
         rows = pd.read_csv(curves)
-        real_steps = rows[rows["seed"] == config["seed"]]["env_steps_total"]
+        is_mine = (rows["variant"] == path.stem) & (rows["seed"] == config["seed"])
+        real_steps = rows[is_mine]["env_steps_total"]
         costs = {"generations": len(real_steps), "real_steps": int(real_steps.max())}
     else:
         return {}

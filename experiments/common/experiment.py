@@ -140,6 +140,11 @@ class Settings(Options):
         """What the rows were computed with."""
         return self.folder / f"{self.files}settings.json.xz"
 
+    @property
+    def summary_file(self) -> Path:
+        """The numbers of the table, which are not kept: the rows give them again."""
+        return self.work_folder / f"{self.files}summary.csv"
+
     def values(self, *names: str) -> dict[str, Any]:
         """These fields."""
         return {name: getattr(self, name) for name in names}

@@ -12,7 +12,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from experiments.common.statistics import performance_profile
 from sejax.ops.files import atomic_path
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
@@ -94,17 +93,6 @@ def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) 
     known = ~np.isnan(values).any(axis=0)
     axis.plot(grid[known], values[:, known].mean(axis=0), color=color, **line)
     axis.fill_between(grid[known], *ends(values[:, known]), color=color, alpha=0.2, lw=0)
-
-
-def profile(
-    axis: Any, groups: Sequence[Any], low: float, high: float, color: str, label: str
-) -> None:
-    """Draws the share of runs with more than each score in [low, high], and its 95% interval."""
-    grid = np.linspace(low, high, 200)
-    shares, *ends = performance_profile(groups, grid)
-    axis.plot(grid, shares, color=color, lw=1.8, label=label)
-    axis.fill_between(grid, *ends, color=color, alpha=0.2, lw=0)
-    axis.set(xlim=(low, high), ylim=(0, 1.02))
 
 
 def threshold(axis: Any, solved_reward: float, label: str | None = None) -> None:

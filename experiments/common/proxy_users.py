@@ -59,7 +59,7 @@ class BreakEven(Settings):
     num_pilots: int | None = count(None, quick=2)
     max_steps: int | None = count(None, quick=3000)  # of an agent with real steps; by the task
     test_episodes: int = count(10)  # of each agent
-    nulls: str = setting("results/null_baselines")  # folder of their summaries, by task
+    nulls: str = setting("results/null_baselines")  # folder of their rows, by task
     pilot_seed: int = setting(500, options.seed())  # first seed of the pilots
     seed: int = setting(1000, options.seed())  # first seed of all others
 

@@ -1,9 +1,9 @@
 """What the paper studies about reward networks, task by task, and the sets of RNs it needs.
 
 RNs are learned once and shared by all experiments: those of a task, variant and objective are one
-file, `<rns_dir>/<env>/<objective>/<variant>.safetensors`, and the curves of their NES runs lie
-beside it. Runs that were interrupted go on, and where more RNs are asked for than a file holds only
-the further ones are learned.
+file, `<rns_dir>/<env>/<objective>/<variant>.safetensors`, and the curves of the NES runs of all
+variants lie beside it, `curves.csv.xz`. Runs that were interrupted go on, and where more RNs are
+asked for than a file holds only the further ones are learned.
 
 Differs: on HalfCheetah the unseen agent, PPO, has the ICM and the number of episodes of TD3; the
 authors' scripts have others for it (`docs/reference.md` 4.8 and 7.3). TD3 is the quick one of
@@ -256,10 +256,13 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         configs = runs.configs_of(config, missing, folder)
         print(f"{variant}: learns {missing} RNs, {config.generations} generations each", flush=True)
         curve = runs.learn(configs, option="rns_dir")
-        if there:
-            before = read_rows(curves_file(path))  # with those beyond, if stopped right here
-            curve = pd.concat([before[before["seed"] < config.seed], curve], ignore_index=True)
-        write_rows(curves_file(path), curve[curve.columns.intersection(KEPT)])
+        curve = curve[curve.columns.intersection(KEPT)].assign(variant=variant)
+        if (file := curves_file(path)).exists():
+            before = read_rows(file)  # with those beyond, if stopped right here
+            first = config.seed if there else 0
+            is_anew = (before["variant"] == variant) & (before["seed"] >= first)
+            curve = pd.concat([before[~is_anew], curve], ignore_index=True)
+        write_rows(file, curve)
         runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
     return there[: settings.learned]
@@ -271,8 +274,8 @@ def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
 
 
 def curves_file(path: Path) -> Path:
-    """Where the curves of the NES runs of a set are kept."""
-    return path.with_suffix(".csv.xz")
+    """Where the curves of the NES runs of a set are kept, beside those of the other variants."""
+    return path.with_name("curves.csv.xz")
 
 
 def stored(settings: RnSettings, variant: str, objective: str) -> Any:

@@ -9,7 +9,6 @@ Where returns have a ceiling, a mean beside the mean of the worst tenth tells ag
 interquartile mean does not.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -54,28 +53,3 @@ def worst_tenth(values: Any) -> float:
     values = np.asarray(values, float)
     lowest = np.sort(values)[: -(-values.size // 10)]
     return float("nan") if np.isnan(values).any() else float(lowest.mean())
-
-
-def performance_profile(
-    groups: Sequence[Any], thresholds: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fraction of runs with a score above each threshold, and its interval at each.
-
-    The interval is that of `mean_interval`, of the groups' fractions, within [0, 1].
-
-    Args:
-      groups: runs of each, `[run]`; a group is what is independent, such as the agents of one SE.
-      thresholds: `[threshold]`.
-
-    Returns:
-      Fractions, lower and upper ends, `[threshold]` each.
-
-    Source: Agarwal et al. (2021), section 4.2, whose intervals are of a stratified bootstrap.
-    """
-
-    def fractions(runs: Any) -> np.ndarray:
-        return (np.asarray(runs, float) > np.reshape(thresholds, (-1, 1))).mean(axis=-1)
-
-    each = np.array([fractions(runs) for runs in groups])
-    low, high = np.array([mean_interval(column) for column in each.T]).clip(0, 1).T
-    return fractions(np.concatenate([*groups])), low, high

@@ -97,9 +97,12 @@ def as_texts(
 def publish(
     settings: Settings, title: str, table: pd.DataFrame, summary: pd.DataFrame, note: str
 ) -> pd.DataFrame:
-    """Writes texts as `table.md` and numbers as `summary.csv`; prints and returns the texts."""
+    """Writes texts as `table.md`, prints and returns them.
+
+    The numbers go to `summary.csv` in the folder `work`, as rows give them again.
+    """
     folder = settings.folder
-    write_text(folder / f"{settings.files}summary.csv", summary.to_csv(index=False))
+    write_text(settings.summary_file, summary.to_csv(index=False))
     rows = [table.columns, ["---"] * len(table.columns), *table.itertuples(index=False)]
     lines = "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
     text = f"# {title}\n\n`{settings.command()}`\n\n{lines}\n\n{note}\n"

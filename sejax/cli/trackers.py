@@ -1,4 +1,4 @@
-"""Following a run with other tools: TensorBoard, Weights & Biases, trackio, or one of your own.
+"""Following a run with other tools: TensorBoard, Weights & Biases, or one of your own.
 
 A tracker hears of each generation after the run directory has it. It adds nothing to a run and
 cannot stop it.
@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 
 from sejax.options import registry, told
-from sejax.options.plain import flatten
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +200,7 @@ class WandbConfig:
 
 
 class Wandb:
-    """A run of Weights & Biases, or of trackio, which has the same functions."""
+    """A run of Weights & Biases that has begun."""
 
     def __init__(self, run: TrackedRun, module: Any, logged: Any):
         self._picture, self._module, self._run = run.picture, module, logged
@@ -221,20 +220,3 @@ class Wandb:
             picture = self._module.Image(str(self._picture))
             self._run.log({"learning_curve": picture}, step=self._last)
         self._run.finish()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackioConfig:
-    """A run of trackio, kept on this machine where `trackio show` finds it."""
-
-    package: ClassVar[str] = "trackio"
-    project: str = "sejax"
-
-    def make(self, run: TrackedRun) -> Wandb:
-        import trackio
-
-        # trackio finds runs again by their names, which must differ between folders.
-        name = f"{run.folder.name}-{run.id}"
-        config = flatten(run.config)
-        made = trackio.init(self.project, name, config=config, resume="allow")
-        return Wandb(run, trackio, made)

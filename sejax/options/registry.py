@@ -166,7 +166,6 @@ GROUPS = {
             "none": "sejax.cli.trackers:NoTracker",
             "tensorboard": "sejax.cli.trackers:TensorBoardConfig",
             "wandb": "sejax.cli.trackers:WandbConfig",
-            "trackio": "sejax.cli.trackers:TrackioConfig",
         },
     ),
     "machines": Group(
