@@ -129,12 +129,11 @@ def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys, word, mean
 
 @pytest.mark.parametrize("name", program.COMMANDS)
 def test_a_command_by_its_word_is_the_module_of_that_name(monkeypatch, capsys, name):
-    by_word = ended(monkeypatch, capsys, program.main, name, "--help")
-
     def by_module():
         runpy.run_module(f"sejax.{name}", run_name="__main__", alter_sys=True)
 
     with warnings.catch_warnings(action="ignore"):  # that it has been imported before
+        by_word = ended(monkeypatch, capsys, program.main, name, "--help")
         assert ended(monkeypatch, capsys, by_module, "--help") == by_word
     assert by_word[0] == 0 and len(by_word[1]) > 5
 

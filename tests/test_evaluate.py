@@ -1,7 +1,6 @@
 """`python -m sejax.evaluate`: fresh agents on a stored proxy, and on the real task."""
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import io
@@ -422,17 +421,10 @@ def test_an_evaluation_in_a_pipe_says_what_it_trains_and_leaves_no_folder_if_ref
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("varied", [False, True])
-def test_an_agent_can_be_pickled_and_one_with_other_numbers_is_not_made_anew(varied):
-    task = sejax.envs.make("cartpole")
-    agent = sejax.make_agent(sejax.DDQNConfig(learning_rate=0.25), task, varied=varied)
-    again = pickle.loads(pickle.dumps(agent))
-    assert again.hparams == agent.hparams and again.spec == agent.spec
-    assert (again.varied is None) == (agent.varied is None)
-    changed = dataclasses.replace(agent, hparams=None)
-    assert copy.copy(changed).hparams is None
-    with pytest.raises(AttributeError):
-        pickle.dumps(changed)
+def test_pickling_an_agent_says_what_to_send_in_its_place():
+    agent = sejax.make_agent(sejax.DDQNConfig(hidden_size=4), sejax.envs.make("cartpole"))
+    with pytest.raises(TypeError, match="Send its configuration"):
+        pickle.dumps(agent)
 
 
 def test_pictures_have_panels_only_of_what_varies(tmp_path, monkeypatch):

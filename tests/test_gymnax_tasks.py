@@ -125,7 +125,7 @@ def test_an_id_that_is_unknown_or_cannot_be_made_is_one_message(monkeypatch):
 
     monkeypatch.setattr(gymnax, "make", make)
     error = refusal(GymnaxTask(name=f"{PREFIX}MNISTBandit-bsuite").make)
-    assert error.field == "env" and "OSError: no network at all." in str(error)
+    assert error.field == "env" and "OSError: no network at all" in str(error)
 
 
 def test_one_that_another_package_registers_is_a_task():

@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # folder; not its neighbours. Names in strings (`sejax.options.registry`, `sejax.__getattr__`) are
 # looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
+    {"__main__"},
     {"search"},
     {"run", "evaluate", "distill"},
     {"cli"},

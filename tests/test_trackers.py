@@ -66,7 +66,7 @@ def test_a_tracker_that_fails_is_dropped_with_one_message(tmp_path, fails, reaso
     tracker.close()
     assert listener.calls == calls
     (message,) = said
-    assert "Listener has failed" in message and message.endswith(reason)
+    assert "Listener has failed" in message and reason in message
 
 
 def test_ctrl_c_is_not_taken_for_a_failure(tmp_path):

@@ -101,14 +101,11 @@ def _make_agent(
         return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, spaces=spaces))
 
     spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
-    if varied:
-        from sejax.agents.varied import make_varied
+    if not varied:
+        return make(config)
+    from sejax.agents.varied import make_varied
 
-        agent = make_varied(config, make)
-    else:
-        agent = make(config)
-    object.__setattr__(agent, "_made_of", (config, task, exploration, varied))
-    return agent
+    return make_varied(config, make)
 
 
 _make_once = functools.cache(_make_agent)

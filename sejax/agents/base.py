@@ -3,8 +3,8 @@
 import collections
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias, TypeVar
 
 import jax
 from flax import linen as nn
@@ -111,15 +111,12 @@ class Agent:
     discount: Callable[[Hparams], Array | float | None] = lambda hparams: None
     batch_size: Callable[[AgentState], Array | None] = lambda state: None
     varied: "Varied | None" = None
-    # Arguments of `sejax.make_agent`, of which a pickled agent is made again.
-    _made_of: tuple[Any, ...] | None = field(default=None, init=False, repr=False)
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        from sejax.agents import make_agent  # which imports this
-
-        if self._made_of is None:
-            return super().__reduce_ex__(protocol)
-        return make_agent, self._made_of
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "An agent holds functions and cannot be pickled. Send its configuration to the other "
+            "process, and call sejax.make_agent there."
+        )
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.
