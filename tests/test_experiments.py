@@ -160,13 +160,12 @@ def test_an_experiment_runs_and_resumes_and_remakes_its_report(
     settings = page.settings.of(**options)
     table = page.run(settings)
     files = {path.name for path in tmp_path.iterdir()}
-    prefix = settings.files
-    assert {f"{prefix}table.md", f"{prefix}settings.json.xz"} <= files
+    assert {"table.md", "settings.json.xz"} <= files
     assert settings.summary_file.exists()
     assert settings.rows_file.exists()
     figures = list(tmp_path.glob("*.png"))
     assert all(map(is_drawn, figures)) and (figures or name == "timings")
-    text = (tmp_path / f"{prefix}table.md").read_text()
+    text = (tmp_path / "table.md").read_text()
     assert f"`python -m experiments.{name} quick=true" in text and str(table.iloc[0, 0]) in text
 
     rows = shards.read_rows(settings.rows_file)

@@ -221,8 +221,9 @@ def evaluated(env, params, task, training, keys):
 
 
 def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
+    other = save_ses(tmp_path / "other.safetensors", 1, "env=acrobot", "agent_hparams=varied")
     for field, given in (("varied", {"varied": ses, "fixed": None}),
-                         ("env", {"fixed": ses, "env": "acrobot"})):  # fmt: skip
+                         ("fixed", {"fixed": ses, "varied": other})):  # fmt: skip
         with pytest.raises(ConfigError) as refused:
             run("se_performance", se_performance, tmp_path, **given)
         assert refused.value.field == field

@@ -110,7 +110,6 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
         0.0,
         10.0,
     )  # by 5, 15, -1, 21
-    assert score_transforms.share_of_best(runs) == {True: pytest.approx(1 - (1 / 4) ** 4, abs=0.01)}
     cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
     assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
     table = score_transforms.make_table(summary)
