@@ -291,17 +291,22 @@ def finite(value: float, digits: int) -> str:
 def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
     """Draws each run's incumbent means as a thin line and their mean as a thick one, by kind."""
     kinds = list(curves.groupby("kind", sort=False))
-    size = (2.6 * len(kinds), 2.6)
-    with figures.panels(path, 1, len(kinds), size, sharey=True) as (_, [axes]):
-        for axis, (kind, mine) in zip(axes, kinds, strict=True):
+    wide = min(len(kinds), 4)
+    high = -(-len(kinds) // wide)
+    with figures.panels(path, high, wide, (2.6 * wide, 0.4 + 2.2 * high), sharey=True) as (_, axes):
+        for axis in axes.flat[len(kinds) :]:
+            axis.remove()
+        for axis, (kind, mine) in zip(axes.flat, kinds, strict=False):
             lines = mine.pivot(index="generation", columns="seed", values="incumbent_mean")
             places = lines.index + 1
             axis.plot(places, lines, color=figures.REAL, lw=0.7, alpha=0.6)
             axis.plot(places, lines.mean(axis=1), color=figures.REAL, lw=2.2)
             figures.threshold(axis, task.solved_reward)
             axis.set_title(kind.replace("_", " "), fontsize=10)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("incumbent's mean return")
+        for axis in axes.flat[max(0, len(kinds) - wide) : len(kinds)]:
             axis.set_xlabel("generation")
-        axes[0].set_ylabel("incumbent's mean return")
 
 
 EXPERIMENT = Experiment(settings=SeDynamics, compute=compute, report=report, about=__doc__)
