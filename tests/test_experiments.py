@@ -57,7 +57,7 @@ TINY = {
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
     "se_distilled": {"env": "cartpole", "students": "ddqn", "quick": True,
                      "run": ["training.max_steps=60", "training.max_episodes=60"]},
-    "se_dynamics": {"kinds": ["bandit", "against_myopic"], "students": "ddqn", "runs": 1,
+    "se_dynamics": {"kinds": ["bandit", "threshold"], "students": "ddqn", "runs": 1,
                     "generations": 2, "num_agents": 2, "test_episodes": 1,
                     "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_feasibility": {"runs": 2, "generations": 2,

@@ -57,11 +57,11 @@ def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]
     """Makes `mean ± std [low, high]` of a row with the columns of `mean_columns`."""
 
     def text(row: Any) -> str:
-        mean, deviation, *ends = (
+        mean, deviation, low, high = (
             getattr(row, f"{name}_{statistic}") for statistic in ("mean", "std", "low", "high")
         )
         spread = f" ± {deviation:,.{digits}f}" if std else ""
-        return f"{mean:,.{digits}f}{spread}{brackets(*ends, digits)}"
+        return f"{mean:,.{digits}f}{spread}{brackets(low, high, digits)}"
 
     return text
 
