@@ -116,10 +116,8 @@ def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable
     seeds = range(settings.seed, settings.seed + settings.policies)
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         for seed in seeds:
-            yield (
-                f"hand-{seed:02d}",
-                functools.partial(bandits.copy_by_hand, task, seed, size, widen),
-            )
+            make = functools.partial(bandits.copy_by_hand, task, seed, size, widen)
+            yield f"hand-{seed:02d}", make
     elif source in ("agent", "episodes"):
         wide = widen if source == "agent" else 0.0
         for (kind, steps), seed in itertools.product(TEACHERS[settings.env].items(), seeds):
@@ -128,26 +126,16 @@ def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable
             make = functools.partial(bandits.copy_of_agent, task, config, steps, seed, size, wide)
             yield f"{kind}-{seed:02d}", make
     elif source == "search":
+        steps = settings.most_search_steps
         for seed in seeds:
-            yield (
-                f"ars-{seed:02d}",
-                functools.partial(
-                    bandits.copy_of_search,
-                    task,
-                    settings.most_search_steps,
-                    seed,
-                    size,
-                    widen,
-                ),
-            )
+            make = functools.partial(bandits.copy_of_search, task, steps, seed, size, widen)
+            yield f"ars-{seed:02d}", make
 
 
 def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Copied]) -> Any:
     """The rows of one table, a cached shard: states `s0...`, actions `a0...`, and its costs."""
-    names = ("seed", "num_states", "widen", "teacher_steps")
+    names = ("seed", "num_states", "states", "widen", "teacher_steps")
     depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
-    if settings.states != "visited":
-        depends["states"] = settings.states
     if source == "search":
         depends["search_steps"] = settings.most_search_steps
 
@@ -156,8 +144,7 @@ def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[
         actions = made.actions.reshape(len(made.actions), -1)
         columns = {f"s{i}": x for i, x in enumerate(made.states.T)}
         columns |= {f"a{i}": x for i, x in enumerate(actions.T)}
-        costs = made._asdict()
-        costs = {x: costs[x] for x in COSTS}
+        costs = {name: getattr(made, name) for name in COSTS}
         return pd.DataFrame(columns | costs)
 
     return settings.shards.compute(f"table-{source}-{name}", depends, compute)

@@ -27,7 +27,6 @@ from experiments.common.tables import publish
 from sejax.options import each_of, require
 
 PICKS = ("best", "worst")  # by their scores
-QUICK_LEARNED = 4
 OBJECTIVE_NAMES = {
     "reward_threshold": "reward threshold",
     "auc": "area under the curve",
@@ -48,8 +47,7 @@ class RnObjectives(CurveSettings):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        learned = {"learned": QUICK_LEARNED} if given.get("quick") else {}
-        default = super().defaults(learned | dict(given)) | learned
+        default = super().defaults(given)
         if len(given.get("picks", PICKS)) > 1:  # as few as leave picks apart
             half = given.get("learned", default["learned"]) // 2
             default["rns"] = max(1, min(default["rns"], half))
@@ -87,7 +85,6 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     tables: list[pd.DataFrame] = []
     for objective, pick in itertools.product(settings.objectives, settings.picks):
         mine = beside(settings, rows, objective, pick)
-        rn_curves.require_rows(settings, mine)
         summary = rn_curves.summarise(mine, settings.max_steps)
         table = rn_curves.make_table(summary)
         has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)

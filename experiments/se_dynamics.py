@@ -17,7 +17,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -62,25 +62,15 @@ NOT_BANDIT = {
     ),
     ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
-# A small proxy and agents that learn enough to be seen moving.
-QUICK = (
-    "es.population_size=12",
-    "es.num_incumbent_evals=6",
-    "training.max_steps=1000",
-    "proxy.hidden_size=32",
-    "agent.hidden_size=32",
-    "agent.batch_size=32",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeDynamics(RunSettings):
     name = "se_dynamics"
-    num_runs: ClassVar[Mapping[str, int]] = {"cartpole": 10, "acrobot": 10}
 
     generations: int | None = count(40, quick=3)  # outer iterations
     kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
-    runs: int = count(3, quick=2)  # NES runs of each kind; cartpole and acrobot 10
+    runs: int = count(10, quick=2)  # NES runs of each kind
     max_steps: int = count(4000, quick=1000)  # of an agent, but on bandits
     # Kinds of agents; all that fit the task.
     students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
@@ -120,7 +110,7 @@ class SeDynamics(RunSettings):
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
-        return self.learn_config([*(QUICK if self.quick else ()), *words])
+        return self.learn_config([*(runs.QUICK if self.quick else ()), *words])
 
 
 def compute(settings: SeDynamics) -> pd.DataFrame:
@@ -170,8 +160,6 @@ def test(
     se = sejax.load_proxy(Path(config.run_dir))
     name = f"seed{config.seed}"
     group = Group(name, se.params, se.fingerprint)
-    # Without a least length, as in the shards of before there was one.
-    proxy = {k: x for k, x in se.config["proxy"].items() if (k, x) != ("min_steps", 1)}
     own = dataclasses.replace(settings, seed=config.seed)  # agents on other SEs have other seeds
 
     def condition(name: str, agent: Any) -> Condition:
@@ -185,7 +173,7 @@ def test(
             groups=(group,),
             agent=agent,
             training=training,
-            settings={"proxy": proxy},
+            settings={"proxy": se.config["proxy"]},
         )
 
     found = []
@@ -194,7 +182,7 @@ def test(
         found.append(train_groups(tested, own, settings.num_agents).assign(student=student))
     (learner,) = se.learned_agents().values()
     sighted = condition(f"{kind}-discount-", learner)
-    found.append(se_myopia.train_with_discounts(own, sighted, se_myopia.DISCOUNTS))
+    found.append(se_myopia.train_with_discounts(own, sighted))
     made_with = {f"{condition}-{name}": x for condition, x in own.shards.made_with.items()}
     settings.shards.made_with.update(made_with)
     return pd.concat(found, ignore_index=True).reindex(columns=list(TESTS))

@@ -7,10 +7,9 @@ Each run is that of `python -m sejax.run` with the same settings and seed. The b
 into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixed`).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,18 +21,6 @@ from experiments.common.runs import RunSettings
 from experiments.common.statistics import worst_tenth
 from sejax.cli.config import AGENT_HPARAMS
 from sejax.options import one_of, require
-
-# A small proxy and agents that learn enough to be seen moving.
-QUICK = [
-    "generations=8",
-    "es.population_size=12",
-    "es.num_incumbent_evals=8",
-    "agent.hidden_size=32",
-    "agent.batch_size=32",
-    "agent.warmup_episodes=1",
-    "training.max_steps=1500",
-    "proxy.hidden_size=32",
-]
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach
 # agents to solve a task"; appendix "Discussion on the Feasibility": 40 runs of 200 iterations with
@@ -50,10 +37,9 @@ PAPER = {
 @dataclass(frozen=True, kw_only=True)
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
-    num_runs: ClassVar[Mapping[str, int]] = {"cartpole": 10}
 
-    runs: int = count(5, quick=3)  # independent NES runs; cartpole 10
-    agent: str | None = setting(None)  # that the SEs are learned with; the task's choice
+    generations: int | None = count(None, quick=8)  # outer iterations; the preset's
+    runs: int = count(10, quick=3)  # independent NES runs
     agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))  # varied: drawn for each agent
 
 
@@ -69,8 +55,7 @@ def compute(settings: SeFeasibility) -> pd.DataFrame:
 def learning_config(settings: SeFeasibility) -> Any:
     """The configuration of the NES runs."""
     words = [f"agent_hparams={settings.agent_hparams}"]
-    words += [f"agent={settings.agent}"] if settings.agent else []
-    config = settings.learn_config(words + (QUICK if settings.quick else []))
+    config = settings.learn_config([*words, *(runs.QUICK if settings.quick else ())])
     require(
         config.name("proxy") != "rn",
         "run.proxy",

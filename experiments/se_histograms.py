@@ -339,7 +339,8 @@ def draw(task: Task, bins: pd.DataFrame, path: Path) -> None:
                 edges = bin_edges(mine, samples)
                 for source, values in samples.items():
                     color, _ = SOURCES[source]
-                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=color)
+                    axis.hist(values, edges, histtype="stepfilled", alpha=0.3, color=color)
+                    axis.hist(values, edges, histtype="step", lw=1.1, color=color, log=True)
                 axis.set_xlim(edges[0], edges[-1])
                 axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
             line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")

@@ -17,7 +17,7 @@ More and less are those of Student's 95% interval over the agents of an SE, in p
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,7 +42,7 @@ from experiments.common.shards import stack, unstack
 from experiments.common.statistics import mean_interval
 from sejax import ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
-from sejax.options import fraction, positive, registry, require
+from sejax.options import positive, registry, require
 from sejax.proxies import header
 
 STORED = (  # below results/
@@ -66,15 +66,6 @@ class SeMyopia(Settings):
     max_steps: int | None = count(None, quick=1000)  # of training; as the SE's configuration says
     # Difference that counts as none, as a share of the way from untrained agents to solved.
     margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
-    discounts: tuple[float, ...] = setting(DISCOUNTS)  # the least and the greatest are compared
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for discount in self.discounts:
-            fraction()("discounts", discount, 0.99)
-        two = len(set(self.discounts)) > 1
-        must = "must hold two that differ, which are compared; got fewer. Set discounts=[0,0.99]."
-        require(two, "discounts", must)
 
 
 class Se(NamedTuple):
@@ -160,7 +151,7 @@ def compute(settings: SeMyopia) -> pd.DataFrame:
             training=training,
             settings={"proxy": ses.config["proxy"]},
         )
-        agents.append(train_with_discounts(settings, condition, settings.discounts))
+        agents.append(train_with_discounts(settings, condition))
     return stack({"ses": pd.DataFrame(map(describe, found)), "agents": pd.concat(agents)})
 
 
@@ -178,12 +169,10 @@ def describe(se: Se) -> dict[str, Any]:
     }
 
 
-def train_with_discounts(
-    settings: Any, condition: Condition, discounts: Sequence[float]
-) -> pd.DataFrame:
+def train_with_discounts(settings: Any, condition: Condition) -> pd.DataFrame:
     """Rows of the agents of a condition with each discount, in the column `discount`."""
     tables = []
-    for discount in discounts:
+    for discount in DISCOUNTS:
         pairs = [group._replace(params=(discount, group.params)) for group in condition.groups]
         sighted = dataclasses.replace(
             condition,
@@ -282,8 +271,7 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
     ses, agents = unstack(rows, "ses"), unstack(rows, "agents")
     summary = summarise(ses, agents, task.solved_reward, settings.margin)
-    discounts = sorted(agents["discount"].dropna().unique())
-    draw(settings, summary, discounts)
+    draw(settings, summary)
     shown: dict[str, Any] = {
         "SEs": "{set}",
         "number": "{num_ses}",
@@ -292,12 +280,12 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
         "starts": "{initial_state}",
         "steps of an episode": "{steps:.1f}",
     }
-    for discount in discounts:
+    for discount in DISCOUNTS:
         shown[f"discount {discount:g}"] = cell(column(discount))
     shown["verdict"] = "{verdict}"
     table = tables.as_texts(summary, shown)
     kind = figures.AGENT_NAMES["td3" if task.num_actions is None else "ddqn"]
-    least, most = discounts[0], discounts[-1]
+    least, most = DISCOUNTS[0], DISCOUNTS[-1]
     untrained = summary["untrained"].iloc[0]
     none = settings.margin * (task.solved_reward - untrained)
     note = (
@@ -327,18 +315,18 @@ def cell(name: str) -> Any:
     return lambda row: f"{mean(row)} ({getattr(row, f'{name}_worst'):,.1f})"
 
 
-def draw(settings: SeMyopia, summary: pd.DataFrame, discounts: list[float]) -> None:
+def draw(settings: SeMyopia, summary: pd.DataFrame) -> None:
     """Mean returns against discounts: a line for each set, with the verdict on most of its SEs."""
     task = envs.make(settings.env)
     with figures.panels(settings.folder / "myopia.png", 1, 1, (6.4, 3.8)) as (figure, [[axes]]):
         for row in summary.to_dict("records"):
-            means = [row[f"{column(discount)}_mean"] for discount in discounts]
+            means = [row[f"{column(discount)}_mean"] for discount in DISCOUNTS]
             kind = next(x for x in KINDS if row["verdict"].startswith(x))
-            axes.plot(range(len(discounts)), means, "o-", ms=3, lw=1, color=KINDS[kind], alpha=0.7)
+            axes.plot(range(len(DISCOUNTS)), means, "o-", ms=3, lw=1, color=KINDS[kind], alpha=0.7)
         for kind, color in KINDS.items():
             axes.plot([], [], "o-", ms=3, lw=1, color=color, label=kind)
         figures.threshold(axes, task.solved_reward)
-        axes.set_xticks(range(len(discounts)), [f"{x:g}" for x in discounts])
+        axes.set_xticks(range(len(DISCOUNTS)), [f"{x:g}" for x in DISCOUNTS])
         axes.set(xlabel="discount of the agents", ylabel=f"mean return on {task.name}")
         figures.legend_above(figure, axes)
 

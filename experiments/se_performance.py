@@ -24,11 +24,11 @@ import pandas as pd
 import sejax
 from experiments.common import agents as groups
 from experiments.common import figures, tables
-from experiments.common.agents import Condition, SeAgents, return_columns
-from experiments.common.experiment import Experiment, count, setting
+from experiments.common.agents import SE_AGENTS, Condition, return_columns
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, envs
-from sejax.options import require, shortened
+from sejax.options import each_of, require, shortened
 from sejax.training import TrainingConfig
 
 NUM_BEST = 5
@@ -67,12 +67,16 @@ PAPER_RETURNS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class SePerformance(SeAgents):
+class SePerformance(Settings):
     name = "se_performance"
 
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
+    num_agents: int = count(10, quick=4)  # for each SE
+    num_ses: int = count(40, quick=3)  # SEs of a set at most
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
     varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
     fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
-    env: str | None = setting(None)  # task, where no file is given; cartpole
     # Groups of agents on the real task, which is slow; as many as SEs.
     real_groups: int | None = count(None)
     # On the real task; 1000 (discrete TD3 in Acrobot 500).
@@ -84,15 +88,15 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     sets = load_sets(settings)
     for name, ses in sets.items():
         print(f"{name}: {len(ses)} SEs, {len(solved_ones(ses))} of which reached the threshold")
-    task = envs.make(task_name(settings, sets))
+    task = envs.make(task_name(sets))
     parts = []
     for kind in settings.agents:
         conditions = {"real": on_real(settings, task, sets, kind)}
-        conditions |= {name: groups.on_ses(settings, ses, kind) for name, ses in sets.items()}
-        parts += [
-            groups.train_kind(settings, condition).assign(kind=kind, setting=name)
-            for name, condition in conditions.items()
-        ]
+        conditions |= {name: on_ses(settings, ses, kind) for name, ses in sets.items()}
+        for name, condition in conditions.items():
+            at_once = groups.groups_at_once(settings.devices)
+            rows = groups.train_groups(condition, settings, settings.num_agents, at_once=at_once)
+            parts.append(rows.assign(kind=kind, setting=name))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -105,7 +109,7 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
     """The sets of SEs that are compared, by how they were learned; those with a file."""
     files = {name: x for name, x in settings.values("varied", "fixed").items() if x is not None}
     if settings.quick and not files:
-        files["fixed"] = settings.env or "cartpole"
+        files["fixed"] = "cartpole"
     sets = {}
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
@@ -121,16 +125,24 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
     return sets
 
 
-def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
-    """The one task of all sets."""
-    asked = {settings.env} if settings.env else set()
-    names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
+def task_name(sets: dict[str, Any]) -> str:
+    """The one task of all sets; without one CartPole."""
+    names = sorted({str(ses.task.name) for ses in sets.values()})
     require(
         len(names) <= 1,
-        "env",
-        f"must be one task for all files; got {', '.join(names)}. Set files of the same task.",
+        "fixed",
+        f"must be SEs of the same task as varied; got {', '.join(names)}. Set fixed=FILE.",
     )
     return names[0] if names else "cartpole"
+
+
+def on_ses(settings: SePerformance, ses: ProxySet, kind: str) -> Condition:
+    """The SEs of a set; agents train as long as those that the SEs were learned with."""
+    agent = groups.agent_config(settings, kind)
+    training = groups.training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
+    # The weights' hash is in the name, so that sets can share a folder.
+    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
+    return Condition.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
 
 
 def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str) -> Condition:
@@ -228,7 +240,7 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
-    task = envs.make(task_name(settings, load_sets(settings)))
+    task = envs.make(task_name(load_sets(settings)))
     agents = with_best(rows)
     summary = summarise(agents, task.solved_reward)
     draw(task, agents, settings.folder / "performance.png")

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -233,17 +233,9 @@ def make_recorder(
 # --- one fresh agent ------------------------------------------------------------------------------
 
 
-@overload
 def make_evaluator(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: Literal[False] = False
-) -> Callable[..., Outcome]: ...
-@overload
-def make_evaluator(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: Literal[True]
-) -> Callable[..., tuple[Outcome, Steps]]: ...
-def make_evaluator(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: bool = False
-) -> Callable[..., Any]:
+    agent: Agent, env: Any, task: Task, training: TrainingConfig
+) -> Callable[..., Outcome]:
     """Builds `evaluate(key, env_params, active=True, eval_steps=None) -> Outcome`.
 
     A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
@@ -256,8 +248,6 @@ def make_evaluator(
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
-      record: whether it returns `(Outcome, Steps)`, with every step of the tests; the outcome is
-        the same.
 
     Raises:
       ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
@@ -292,7 +282,6 @@ def make_evaluator(
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)
-        recorder = make_recorder(agent, task, training.test_episodes) if record else None
         train = make_tested_trainer(agent, env, task, training)
 
         def run(
@@ -306,7 +295,7 @@ def make_evaluator(
             result = train(key_train, env_params, hparams, active)
             tests = test(key_test, result.agent_state, active, eval_steps)
             real_steps = tests.num_steps.sum() + result.eval_steps
-            outcome = Outcome(
+            return Outcome(
                 test_returns=tests.returns,
                 scored_returns=tests.scored,
                 train_steps=result.train_steps,
@@ -315,7 +304,6 @@ def make_evaluator(
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
                 real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
             )
-            return (outcome, recorder(key_test, result.agent_state)) if recorder else outcome
 
         return run
 

@@ -45,14 +45,14 @@ def test_the_controller_of_cartpole_balances_and_is_copied():
 def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
     copied = bandits.copy_of_search(task, real_steps=100_000, seed=0, num_states=8, widen=0.0)
     assert copied.policy_return >= least
-    tests = 2 * bandits.TEST_EPISODES * 20  # the random episodes and the last tests, at least
+    tests = 2 * bandits.TEST_EPISODES * 20  # of a generation, and the last ones, at least
     assert tests < copied.real_steps < 110_000
 
 
 def test_a_search_ends_when_its_steps_are_spent():
     task = envs.make("pendulum")  # whose episodes all have 200 steps
     copied = bandits.copy_of_search(task, real_steps=1, seed=0, num_states=8, widen=0.0)
-    one_generation = 3 * bandits.TEST_EPISODES + 2 * bandits.ARS_DIRECTIONS
+    one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS.num_directions + 1
     assert copied.real_steps == 200 * one_generation
     assert copied.policy_return < task.solved_reward
 

@@ -21,7 +21,7 @@ from support import is_drawn, refuse
 import experiments
 import sejax
 from experiments import score_transforms
-from experiments.common import agents, curves, experiment, runs, shards, supervised_models
+from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax import envs
@@ -57,20 +57,16 @@ TINY = {
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
     "se_distilled": {"env": "cartpole", "students": "ddqn", "quick": True,
                      "run": ["training.max_steps=60", "training.max_episodes=60"]},
-    "se_dynamics": {"kinds": ["bandit", "against_myopic"], "students": "ddqn", "runs": 1,
+    "se_dynamics": {"kinds": ["bandit", "threshold"], "students": "ddqn", "runs": 1,
                     "generations": 2, "num_agents": 2, "test_episodes": 1,
                     "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_feasibility": {"runs": 2, "generations": 2,
                        "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_histograms": {"proxy": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
                       "max_rows": 50},
-    "se_models": {"ses": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2},
     "se_myopia": {"ses": "se", "num_agents": 2, "test_episodes": 1},
     "se_performance": {"fixed": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
                        "real_episodes": 3},
-    "supervised_baseline": {"proxy": "se", "hparams": "default", "models": 3, "generations": 2,
-                            "population": 2, "max_rows": 30, "epochs": 2, "num_agents": 2,
-                            "test_episodes": 2},
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = set(TINY) - {"timings"}
@@ -106,7 +102,7 @@ def tiny(monkeypatch):
 
 def refuse_to_compute(monkeypatch):
     places = {agents: "train", session.Chunks: "advance", score_transforms: "compute_cell"}
-    for place, name in (*places.items(), *((supervised_models, x) for x in ("collect", "fit_all"))):
+    for place, name in places.items():
         monkeypatch.setattr(place, name, refuse)
 
 
@@ -148,27 +144,7 @@ def check_responses(settings, _):
     assert num_checked
 
 
-def check_models(settings, _):
-    """Each transition is a real step; the variants differ in the network for the end only."""
-    rows = shard(settings, "transitions-0")
-    assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
-    for _, row in rows.iterrows():
-        obs, terminated = real_step(row[STATES].to_numpy(np.float32), row["action"])
-        np.testing.assert_allclose(obs, [row[f"next_{name}"] for name in STATES], atol=1e-5)
-        assert terminated == bool(row["terminated"])
-    authors, fair = (
-        sejax.load_set(settings.folder / f"models-{name}.safetensors")
-        for name in ("authors", "fair")
-    )
-    assert len(authors) == len(fair) == 3
-    assert [x.config["proxy"]["done"] for x in (authors, fair)] == ["soft", "threshold"]
-    for head, same in (("state", True), ("reward", True), ("done", False)):
-        pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),
-                    strict=True)  # fmt: skip
-        assert all(np.array_equal(a, b) for a, b in pairs) == same, head
-
-
-CHECKS = {"se_histograms": check_responses, "supervised_baseline": check_models}  # of the rows
+CHECKS = {"se_histograms": check_responses}  # of the rows
 
 
 @pytest.mark.parametrize(
@@ -184,13 +160,12 @@ def test_an_experiment_runs_and_resumes_and_remakes_its_report(
     settings = page.settings.of(**options)
     table = page.run(settings)
     files = {path.name for path in tmp_path.iterdir()}
-    prefix = settings.files
-    assert {f"{prefix}table.md", f"{prefix}settings.json.xz"} <= files
+    assert {"table.md", "settings.json.xz"} <= files
     assert settings.summary_file.exists()
     assert settings.rows_file.exists()
     figures = list(tmp_path.glob("*.png"))
     assert all(map(is_drawn, figures)) and (figures or name == "timings")
-    text = (tmp_path / f"{prefix}table.md").read_text()
+    text = (tmp_path / "table.md").read_text()
     assert f"`python -m experiments.{name} quick=true" in text and str(table.iloc[0, 0]) in text
 
     rows = shards.read_rows(settings.rows_file)
@@ -231,7 +206,7 @@ def test_all_experiments_are_listed_and_nothing_else_is_a_command():
     assert set(TINY) == set(NAMES)
     refused = (
         "import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
-        "try: runpy.run_module('experiments.se_models', run_name='__main__')\n"
+        "try: runpy.run_module('experiments.se_myopia', run_name='__main__')\n"
         "finally: print('gymnax' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", refused], capture_output=True, text=True)

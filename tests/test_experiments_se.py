@@ -11,7 +11,7 @@ from support import paper_training
 from test_experiments import TINY, TINY_AGENT, save_ses
 
 import sejax
-from experiments import se_feasibility, se_models, se_performance
+from experiments import se_feasibility, se_performance
 from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import (
     mean_interval,
@@ -167,17 +167,6 @@ def test_the_density_is_that_of_reflected_kernels():
     assert np.trapezoid(equal, grid) == pytest.approx(1, abs=1e-3) and np.argmax(equal) == 4000
 
 
-def test_single_ses_are_sorted_and_their_ranks_correlated():
-    agents = made_up_agents()
-    other = agents.assign(kind="ddqn", test_return=-agents["test_return"])
-    summary = se_models.summarise(pd.concat([agents, other]), solved_reward=15)
-    assert summary["kind"].tolist() == ["td3_discrete"] * 4 + ["ddqn"] * 4
-    assert summary["se"].tolist() == [3, 2, 1, 0, 0, 1, 2, 3]
-    assert summary["solved"].tolist()[:4] == [1, 1, 0, 0]
-    assert se_models.rank_correlations(summary).loc["ddqn", "td3_discrete"] == pytest.approx(-1)
-    assert "td3_discrete and ddqn -1.00" in se_models.correlations_text(summary)
-
-
 @pytest.mark.slow
 def test_performance_trains_as_evaluation_does(ses, tmp_path, tiny_agents):
     given = {"num_agents": 3, "num_ses": 2}
@@ -191,8 +180,6 @@ def test_performance_trains_as_evaluation_does(ses, tmp_path, tiny_agents):
     for name in ("learning_rate", "batch_size", "hidden_size", "num_layers"):
         np.testing.assert_array_equal(real[name], fixed[name])
         assert real[name].nunique() > 1
-    single = run("se_models", se_models, tmp_path, ses=ses, **given)  # finds what was trained
-    assert set(single["SE"]) == {0, 1} and set(single["run's seed"]) == {7, 8}
 
 
 def check_as_evaluation(ses, rows):
@@ -234,8 +221,9 @@ def evaluated(env, params, task, training, keys):
 
 
 def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
+    other = save_ses(tmp_path / "other.safetensors", 1, "env=acrobot", "agent_hparams=varied")
     for field, given in (("varied", {"varied": ses, "fixed": None}),
-                         ("env", {"fixed": ses, "env": "acrobot"})):  # fmt: skip
+                         ("fixed", {"fixed": ses, "varied": other})):  # fmt: skip
         with pytest.raises(ConfigError) as refused:
             run("se_performance", se_performance, tmp_path, **given)
         assert refused.value.field == field

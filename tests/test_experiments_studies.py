@@ -1,4 +1,4 @@
-"""The experiments on score transforms, on histograms of SEs and on supervised models."""
+"""The experiments on score transforms and on histograms of SEs."""
 
 from types import SimpleNamespace
 
@@ -7,14 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from support import numpy_forward
 from test_experiments import TINY_AGENT, save_ses
 
 import sejax
-from experiments import score_transforms, se_histograms, supervised_baseline
-from experiments.common import supervised_models
+from experiments import score_transforms, se_histograms
 from sejax.bilevel import make_bilevel
-from sejax.options import ConfigError
 from sejax.training import make_trainer
 
 
@@ -113,7 +110,6 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
         0.0,
         10.0,
     )  # by 5, 15, -1, 21
-    assert score_transforms.share_of_best(runs) == {True: pytest.approx(1 - (1 / 4) ** 4, abs=0.01)}
     cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
     assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
     table = score_transforms.make_table(summary)
@@ -169,119 +165,3 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
         "state 0", "reward",
     ]  # fmt: skip
     assert table["return"][0] == "1.50 ± 0.71", "of the two test episodes"
-
-
-# --- supervised models ----------------------------------------------------------------------------
-
-
-def test_a_sample_is_uniform_over_all_that_was_added():
-    counts = np.zeros(20)
-    for seed in range(400):
-        rng, kept = np.random.default_rng(seed), None
-        for start, stop in ((0, 3), (3, 4), (4, 20)):
-            rows = pd.DataFrame({"row": range(start, stop)})
-            kept = supervised_models.sampled(kept, rows, 5, rng)
-            assert len(kept) == min(stop, 5)
-        drawn = kept["row"]
-        assert drawn.nunique() == 5
-        counts[drawn] += 1
-    error = np.sqrt(400 * 0.25 * 0.75)  # each row is drawn with probability 5 / 20
-    assert np.abs(counts - 100).max() < 5 * error
-
-
-def random_data(num_rows):
-    rng = np.random.default_rng(0)
-    states, targets = rng.normal(size=(num_rows, 4)), rng.normal(size=(num_rows, 5))
-    return (states.astype(np.float32), rng.integers(0, 2, num_rows), targets.astype(np.float32),
-            rng.integers(0, 2, num_rows).astype(np.float32))  # fmt: skip
-
-
-def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
-    env = sejax.load_set(se_file).env
-    data = random_data(6)
-    states, actions, targets, ends = data
-    initial, fitted, errors = supervised_models.make_fit(env, 6, 1)(jax.random.key(2), *data)
-    squares, end_squares = [], []
-    for state, action, target, end in zip(states, actions, targets, ends, strict=True):
-        x = np.concatenate([np.eye(2)[action], state])
-        out = {head: numpy_forward(initial[head], x, "leaky_relu", 1) for head in initial}
-        squares.append((np.concatenate([out["state"], out["reward"]]) - target) ** 2)
-        end_squares.append((out["done"] - end) ** 2)
-    np.testing.assert_allclose(errors[0], [np.mean(squares), np.mean(end_squares)], rtol=1e-4)
-    # Adam's first step is the learning rate against the gradient's sign; that of the reward's bias
-    # is that of the mean error.
-    step = fitted["reward"]["Dense_1"]["bias"] - initial["reward"]["Dense_1"]["bias"]
-    mean_error = np.mean([
-        numpy_forward(initial["reward"], np.concatenate([np.eye(2)[a], s]), "leaky_relu", 1) - t[-1]
-        for s, a, t in zip(states, actions, targets, strict=True)
-    ])  # fmt: skip
-    np.testing.assert_allclose(step, -1e-4 * np.sign(mean_error), rtol=1e-2)
-
-
-def test_one_fit_serves_both_models_as_the_networks_share_nothing(se_file):
-    env = sejax.load_set(se_file).env
-    states, actions, targets, ends = random_data(8)
-    fit = jax.jit(supervised_models.make_fit(env, 8, 5))
-    _, a, _ = fit(jax.random.key(2), states, actions, targets, ends)
-    _, b, errors = fit(jax.random.key(2), states, actions, targets, 1 - ends)
-    for head in ("state", "reward"):
-        for x, y in zip(jax.tree.leaves(a[head]), jax.tree.leaves(b[head]), strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-5)
-    assert any((x != y).any() for x, y in zip(jax.tree.leaves(a["done"]),
-                                              jax.tree.leaves(b["done"]), strict=True))  # fmt: skip
-    assert (errors[-1] < errors[0]).all()
-
-
-def test_models_are_summarised_and_the_best_ones_are_those_of_the_best_episodes():
-    agents = pd.DataFrame({
-        "kind": "ddqn", "hparams": "varied", "world": ["authors"] * 6 + ["se"] * 6,
-        "group": [0, 0, 1, 1, 2, 2] * 2, "nonfinite": False, "train_steps": 10,
-        "train_episodes": 1, "return_0": [0, 2, 10, 10, 30, 30] + [200] * 6,
-        "return_1": [2, 4, 10, 10, 30, 30] + [200] * 6,
-    })  # fmt: skip
-    agents["test_return"] = agents[["return_0", "return_1"]].mean(axis=1)
-    agents = supervised_baseline.with_best(agents, [50.0, 10.0, 90.0])
-    summary = supervised_baseline.summarise(agents, 195.0).set_index("world")
-    assert summary.loc["authors", "return_mean"] == pytest.approx(14)
-    assert np.isnan(summary.loc["authors", "return_low"])  # of three models
-    low, high = summary.loc["se", ["return_low", "return_high"]]  # of six agents
-    assert low == high == 200
-    assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
-    assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
-    table = supervised_baseline.make_table(summary.reset_index())
-    assert list(table["paper's"]) == ["15.01", "17.73", "190.7"]
-    agents.loc[agents["group"] == 2, "nonfinite"] = True  # also those of the best models' copies
-    assert supervised_baseline.diverged_text(agents[agents["world"] != "se"]) == (
-        "2 of 6 (model, as the authors)"
-    )
-    few = agents[agents["group"] < 2]
-    assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
-
-
-def test_a_recorded_run_is_the_bilevel_loop():
-    """With the solved rule, whose agents are tested between episodes."""
-    config = sejax.config(["proxy.hidden_size=4", "training.stop_rule=solved",
-                           "training.max_episodes=3", "training.max_steps=450",
-                           "training.test_episodes=1", "agent.warmup_episodes=0",
-                           "agent.hidden_size=4", "agent.batch_size=4", "devices=1",
-                           "es.population_size=2", "es.num_incumbent_evals=1",
-                           "es.mirrored=false"])  # fmt: skip
-    init, generation = supervised_models.make_recorded_run(config)
-    program = make_bilevel(**config.parts())
-    key = jax.random.key(7)
-    state, steps = generation(init(key))
-    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key))
-    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
-    # Those tests between episodes count as real steps, but are not recorded.
-    assert int(info.real_steps.sum()) > int(steps.valid.sum()) > 0
-
-
-@pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
-                                                        "agent.action_repeat=2"]])  # fmt: skip
-def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
-    words = ("preset=soft", "training.max_steps=9000", *overrides)
-    path = save_ses(tmp_path / "se.safetensors", 1, *words)
-    settings = supervised_baseline.SupervisedBaseline.of(quick=True, out=str(tmp_path), proxy=path)
-    with pytest.raises(ConfigError) as refused:
-        supervised_baseline.EXPERIMENT.run(settings)
-    assert refused.value.field == "proxy"

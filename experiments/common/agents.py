@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common.experiment import Settings, count, setting
+from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import each_of, registry
+from sejax.options import registry
 from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
@@ -300,17 +300,6 @@ QUICK_STEPS = 1500
 SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeAgents(Settings):
-    """Settings about agents with drawn hyperparameters that are trained on the SEs of a set."""
-
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
-    num_agents: int = count(10, quick=4)  # for each SE
-    num_ses: int = count(40, quick=3)  # SEs of a set at most
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
-
-
 def agent_config(settings: Settings, kind: str) -> Any:
     """The configuration of a kind of agent."""
     return registry.configure("agent", {"name": kind, **(QUICK_AGENT if settings.quick else {})})
@@ -324,20 +313,3 @@ def training_as_learned(
     limits = [x for x in (learned.max_steps, max_steps) if x is not None]
     most = min(limits, default=None)
     return dataclasses.replace(learned, max_steps=most, test_episodes=test_episodes)
-
-
-def on_ses(settings: SeAgents, ses: ProxySet, kind: str) -> Condition:
-    """The SEs of a set; agents train as long as those that the SEs were learned with."""
-    agent = agent_config(settings, kind)
-    training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
-    # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
-    # of se_performance.
-    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
-    return Condition.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
-
-
-def train_kind(settings: SeAgents, condition: Condition) -> pd.DataFrame:
-    """All agents of a condition, a row each."""
-    at_once = groups_at_once(settings.devices)
-    rows = train_groups(condition, settings, settings.num_agents, at_once=at_once)
-    return rows.assign(kind=condition.name)

@@ -20,17 +20,18 @@ from jaxtyping import Array, Float
 
 import sejax
 from sejax.agents.fixed import make_fixed
+from sejax.distillation.policy_search import Policy, SearchConfig, linear_act, make_search
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_recorder, make_tester
 from sejax.proxies.base import ProxyEnv, ProxyParams
 
-Policy = Callable[[Array], Array]  # an observation [obs_dim] to an action
+Controller = Callable[[Array], Array]  # an observation [obs_dim] to an action
 
 # Controllers in a line each, as a textbook has them; gains are first guesses and were not searched.
 # MountainCar and Acrobot push along a velocity; Pendulum swings up by energy, and balances at the
 # top.
-BY_HAND: dict[str, Policy] = {
+BY_HAND: dict[str, Controller] = {
     "cartpole": lambda s: (0.1 * s[0] + 0.3 * s[1] + s[2] + 0.6 * s[3] > 0).astype(jnp.int32),
     "acrobot": lambda s: jnp.where(s[5] > 0, 2, 0),
     "mountain_car": lambda s: jnp.where(  # Z. Xiao's, of Gym's leaderboard
@@ -269,80 +270,45 @@ def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, wide
       num_states: of the table.
       widen: see `copy`.
 
-    Source: Mania et al., "Simple random search of static linear policies is competitive for
-    reinforcement learning" (2018), Algorithm 2, with the statistics of observations taken from
-    random episodes before the search.
+    Source: `sejax.distillation.policy_search`. The stored rows are of a search of the same
+    algorithm with the moments of observations from random episodes before it.
     """
-    key_random, key_search, key_copy = jax.random.split(jax.random.key(seed), 3)
-    agent, random_episodes, generation = _search(task)
-    steps = random_episodes(key_random)
-    visited = steps.obs[np.asarray(steps.valid)]
-    scale = (visited.mean(0), jnp.maximum(visited.std(0), 1e-6))
-    weights = best = jnp.zeros(_shape(task))
-    best_return, used, started = -np.inf, len(visited), time.process_time()
+    agent, init, generation = _search(task)
+    key_search, key_copy = jax.random.split(jax.random.key(seed))
+    policy = best = init
+    best_return, used, started = -np.inf, 0, time.process_time()
     for i in itertools.count():
-        key = jax.random.fold_in(key_search, i)
-        weights, tests, steps_used = generation(key, weights, scale)
+        policy, steps_used, tests = generation(jax.random.fold_in(key_search, i), policy)
         used += int(steps_used) + int(tests.num_steps.sum())
         if float(tests.returns.mean()) > best_return:
-            best, best_return = weights, float(tests.returns.mean())
+            best, best_return = policy, float(tests.returns.mean())
         if best_return >= task.solved_reward or used >= real_steps:
             break
     cpu_s = time.process_time() - started
-    return copy(task, agent, (best, *scale), key_copy, num_states, used, cpu_s, widen)
-
-
-def _shape(task: Task) -> tuple[int, int]:
-    """Of a linear policy's weights; the last column is a bias."""
-    return task.num_actions or task.action_dim, task.obs_dim + 1
-
-
-@functools.cache
-def _search(task: Task) -> tuple[sejax.Agent, Callable[..., Any], Callable[..., Any]]:
-    """The linear policy as an agent, and compiled: random episodes, a generation of the search."""
-    policy = _linear_policy(task)
-    agent = make_fixed(task, lambda key, state, obs: policy(state, obs))
-    once, tester = make_tester(agent, task, 1), make_tester(agent, task, TEST_EPISODES)
-    record = make_recorder(agent, task, 1)
-
-    @jax.jit
-    def random_episodes(key: Array) -> Any:
-        keys = jax.random.split(key, TEST_EPISODES)
-        weights = jax.vmap(lambda k: jax.random.normal(k, _shape(task)))(keys)
-        scale = (jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim))
-        return jax.vmap(lambda k, w: record(k, (w, *scale)))(keys, weights)
-
-    def generation(key: Array, weights: Array, scale: Any) -> tuple[Array, Any, Array]:
-        key_noise, key_once, key_test = jax.random.split(key, 3)
-        noise = jax.random.normal(key_noise, (ARS_DIRECTIONS, *weights.shape))
-        keys = jax.random.split(key_once, ARS_DIRECTIONS)
-        test_all = jax.vmap(lambda k, w: once(k, (w, *scale)))
-        both = [test_all(keys, weights + sign * ARS_NOISE * noise) for sign in (1, -1)]
-        plus, minus = (tests.returns[:, 0] for tests in both)
-        top = jnp.argsort(-jnp.maximum(plus, minus))[:ARS_TOP]
-        spread = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
-        step = jnp.tensordot((plus - minus)[top], noise[top], 1) / (ARS_TOP * spread)
-        weights = weights + ARS_STEP * step
-        used = both[0].num_steps.sum() + both[1].num_steps.sum()
-        return weights, tester(key_test, (weights, *scale)), used
-
-    state = jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim)
-    shapes = jax.random.key(0), jnp.zeros(_shape(task)), state
-    return agent, random_episodes, jax.jit(generation).lower(*shapes).compile()
+    return copy(task, agent, best, key_copy, num_states, used, cpu_s, widen)
 
 
 # Mania et al. search these for each task; here they are the same for all.
-ARS_DIRECTIONS, ARS_TOP, ARS_NOISE, ARS_STEP = 16, 8, 0.3, 0.3
+ARS = SearchConfig(
+    num_directions=16,
+    num_top=8,
+    noise_std=0.3,
+    step_size=0.3,
+    policy_error=0.0,
+    num_tests=TEST_EPISODES,
+)
 
 
-def _linear_policy(task: Task) -> Callable[[Any, Array], Array]:
-    """The policy of `(weights [output, obs_dim + 1], mean [obs_dim], std [obs_dim])`."""
+@functools.cache
+def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
+    """The linear policy as an agent, one that does nothing, and a compiled, tested generation."""
+    search = make_search(ARS, task)
+    agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
 
-    def policy(state: Any, obs: Array) -> Array:
-        weights, mean, std = state
-        out = weights @ jnp.append((obs - mean) / std, 1.0)
-        if task.num_actions is not None:
-            return jnp.argmax(out).astype(jnp.int32)
-        return task.max_action * jnp.tanh(out)
+    def generation(key: Array, policy: Policy) -> tuple[Policy, Array, Any]:
+        key_search, key_test = jax.random.split(key)
+        policy, tried = search.generation(key_search, policy, 0)  # its step size stays
+        return policy, tried.num_steps, search.test(key_test, policy)
 
-    return policy
+    init = search.init()
+    return agent, init, jax.jit(generation).lower(jax.random.key(0), init).compile()

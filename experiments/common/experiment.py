@@ -65,7 +65,6 @@ class Settings(Options):
     """
 
     name: ClassVar[str]  # of the experiment's module
-    files: ClassVar[str] = ""  # prefix of its files in `out`
 
     quick: bool = setting(False)  # a small version, in minutes
     from_rows: bool = setting(False)  # make table and figures again from the stored rows
@@ -133,17 +132,17 @@ class Settings(Options):
     @property
     def rows_file(self) -> Path:
         """The rows, from which table and figures are made."""
-        return self.folder / f"{self.files}rows.csv.xz"
+        return self.folder / "rows.csv.xz"
 
     @property
     def settings_file(self) -> Path:
         """What the rows were computed with."""
-        return self.folder / f"{self.files}settings.json.xz"
+        return self.folder / "settings.json.xz"
 
     @property
     def summary_file(self) -> Path:
         """The numbers of the table, which are not kept: the rows give them again."""
-        return self.work_folder / f"{self.files}summary.csv"
+        return self.work_folder / "summary.csv"
 
     def values(self, *names: str) -> dict[str, Any]:
         """These fields."""

@@ -68,20 +68,12 @@ def densities(axis: Any, groups: list[tuple[str, np.ndarray]], low: float, high:
     axis.set(yscale="log", ylim=(1e-4 * peak, 2 * peak), xlim=(low, high))
 
 
-def histogram(axis: Any, values: Any, alpha: float, lw: float, label: str = "", **how: Any) -> None:
-    """Draws how often values are met, on a logarithmic scale."""
-    axis.hist(values, histtype="stepfilled", alpha=alpha, **how)
-    axis.hist(values, histtype="step", lw=lw, label=label, **how)
-    axis.set_yscale("log")
-
-
 def bars(axis: Any, groups: list[tuple[str, np.ndarray]], below: Sequence[str]) -> None:
     """Draws means as bars with their std, and a text below each; groups are (colour, values)."""
     for index, (color, values) in enumerate(groups):
         mean, std = values.mean(), values.std()
-        axis.bar(index, mean, color=color, alpha=0.85, width=0.7)
-        errors = [[min(std, mean)], [std]]
-        axis.errorbar(index, mean, yerr=errors, color="#7a7a7a", capsize=3, lw=1.2)
+        errors = {"yerr": [[min(std, mean)], [std]], "ecolor": "#7a7a7a", "capsize": 3}
+        axis.bar(index, mean, color=color, alpha=0.85, width=0.7, **errors)
     axis.set_xticks(range(len(groups)), below, fontsize=8)
     axis.set_ylim(bottom=0)
     axis.ticklabel_format(axis="y", style="plain")
@@ -100,17 +92,11 @@ def threshold(axis: Any, solved_reward: float, label: str | None = None) -> None
     axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
 
 
-def cell_text(axis: Any, x: float, y: float, text: str, is_dark: bool, fontsize: int) -> None:
-    """Writes into a cell of a coloured map, in white on a dark one."""
-    color = "white" if is_dark else "black"
-    axis.text(x, y, text, ha="center", va="center", fontsize=fontsize, color=color)
-
-
-def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None = 9) -> None:
-    """Puts the legend of one panel above all, in so many columns, if the figure is wide enough."""
+def legend_above(figure: Any, axis: Any) -> None:
+    """Puts the legend of one panel above all, in four columns, if the figure is wide enough."""
     handles, labels = axis.get_legend_handles_labels()
-    columns = min(len(labels), columns, max(1, int(figure.get_figwidth() / LEGEND_COLUMN)))
-    figure.legend(handles, labels, ncols=columns, loc="outside upper center", fontsize=fontsize)
+    columns = min(len(labels), 4, max(1, int(figure.get_figwidth() / LEGEND_COLUMN)))
+    figure.legend(handles, labels, ncols=columns, loc="outside upper center", fontsize=9)
 
 
 @contextlib.contextmanager

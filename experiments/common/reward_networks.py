@@ -16,7 +16,7 @@ import functools
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observat
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
 PAPER_ROWS = ("default", "varied", "transfer")
 OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
-# With quick=true; a task's own come on top.
+# With quick=true.
 QUICK: dict[str, Any] = {
     "learned": 2,
     "generations": 4,
@@ -71,8 +71,6 @@ class Study:
     learned: int = 10  # RNs of each variant
     rns: int = 10  # the best ones of them, that agents are trained on
     num_agents: int = 10  # on each of these
-    # Where trainings of the task, or compiling its physics, would take too long with quick=true.
-    when_quick: dict[str, Any] = field(default_factory=dict)
 
 
 # Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
@@ -87,7 +85,6 @@ _CARTPOLE: dict[str, Any] = {
     "buffer_size": 1_000_000,
     "exploration_steps": None,
 }
-_FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
 STUDIES = {
     "cliff_walking": Study(
         # SARSA explores less than the paper's table says, as in the authors' scripts: with an
@@ -109,7 +106,6 @@ STUDIES = {
         bonuses={"icm": ICMConfig()},
         max_episodes=1000,
         max_steps=50_000,
-        when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
     ),
     "mountain_car_continuous": Study(
         agent=None,
@@ -126,16 +122,6 @@ STUDIES = {
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000,
         max_steps=250_000,
-        when_quick=_FEW
-        | {
-            "generations": 2,
-            "run": (
-                "es.population_size=4",
-                "es.num_incumbent_evals=4",
-                "training.max_episodes=4",
-                "agent.warmup_episodes=1",
-            ),
-        },
     ),
     "halfcheetah": Study(
         agent=None,
@@ -155,19 +141,6 @@ STUDIES = {
         learned=5,
         rns=5,
         num_agents=5,
-        when_quick=_FEW
-        | {
-            "generations": 1,
-            "learned": 1,
-            "num_agents": 2,
-            "bonuses": (),
-            "run": (
-                "es.population_size=2",
-                "es.num_incumbent_evals=2",
-                "training.max_episodes=2",
-                "agent.warmup_episodes=1",
-            ),
-        },
     ),
 }
 # Columns of the NES runs' curves: scores and costs.
@@ -209,7 +182,7 @@ class RnSettings(RunSettings):
         options.one_of(STUDIES)("env", env, "cliff_walking")
         study = STUDIES[env]
         values = vars(study) | {"bonuses": tuple(study.bonuses)}
-        values |= QUICK | study.when_quick if given.get("quick") else {}
+        values |= QUICK if given.get("quick") else {}
         return default | {name: values[name] for name in default.keys() & values.keys()}
 
     def __post_init__(self) -> None:

@@ -139,30 +139,6 @@ def by_row(settings: CurveSettings, rows: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([rows[rows["row"] == row] for row in settings.rows], ignore_index=True)
 
 
-def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
-    """Checks that stored rows have as many groups and agents as a table's text will say.
-
-    Raises:
-      ConfigError: if they do not, as where other settings made them.
-    """
-
-    def same(name: str, there: Any, asked: Any) -> None:
-        require(
-            there == asked,
-            name,
-            f"must be {there}, as in {settings.rows_file}; got {asked}. Set {name}={there}, or "
-            "from_rows=false.",
-        )
-
-    there = rows["row"].unique()
-    same("rows", *(f"[{','.join(sorted(names))}]" for names in (there, settings.rows)))
-    for (_, world), mine in rows.groupby(["row", "world"], sort=False):
-        groups = mine["group"].nunique()
-        same("num_agents", mine["agent"].nunique() // groups, settings.num_agents)
-        name = "bonus_groups" if world in settings.study.bonuses else "rns"
-        same(name, groups, settings.values(name)[name])
-
-
 def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and condition.
 

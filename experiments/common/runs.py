@@ -6,10 +6,10 @@ of its own: one that was stopped goes on, and a finished one is kept.
 
 import dataclasses
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,25 +23,26 @@ from sejax.cli.progress import Tally
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
 
+# With quick=true: a small SE and agents that learn enough to be seen moving.
+QUICK = (
+    "es.population_size=12",
+    "es.num_incumbent_evals=8",
+    "training.max_steps=1500",
+    "proxy.hidden_size=32",
+    "agent.hidden_size=32",
+    "agent.batch_size=32",
+    "agent.warmup_episodes=1",
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(Settings):
-    """Settings about the NES runs; `num_runs` has the default of a field `runs` by task."""
-
-    num_runs: ClassVar[Mapping[str, int]] = {}
+    """Settings about the NES runs."""
 
     env: str = setting("cartpole")  # task: cartpole, acrobot, ...
     generations: int | None = count(None)  # outer iterations; the preset's
     preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
     run: tuple[str, ...] = setting(())  # overrides of the NES runs, or as below
-
-    @classmethod
-    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        default = super().defaults(given)
-        task = given.get("env", default["env"])
-        if not given.get("quick") and task in cls.num_runs:
-            default["runs"] = cls.num_runs[task]
-        return default
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-LEVEL, NUM_RESAMPLES = 0.95, 2000
+LEVEL = 0.95
 LEAST = 5  # independent values of an interval: the range of two holds the median half of the time
 NONE = (float("nan"), float("nan"))  # of fewer
 

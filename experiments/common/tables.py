@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
 from experiments.common.experiment import Settings
 from experiments.common.statistics import (
@@ -55,20 +53,17 @@ def brackets(low: float, high: float, digits: int) -> str:
     return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
 
 
-def with_interval(value: str, ends: str, digits: int, std: str = "") -> Callable[[Any], str]:
-    """Makes `value ± std [ends_low, ends_high]` of a row with columns of these names."""
+def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
+    """Makes `mean ± std [low, high]` of a row with the columns of `mean_columns`."""
 
     def text(row: Any) -> str:
-        spread = f" ± {getattr(row, std):,.{digits}f}" if std else ""
-        low, high = getattr(row, f"{ends}_low"), getattr(row, f"{ends}_high")
-        return f"{getattr(row, value):,.{digits}f}{spread}{brackets(low, high, digits)}"
+        mean, deviation, low, high = (
+            getattr(row, f"{name}_{statistic}") for statistic in ("mean", "std", "low", "high")
+        )
+        spread = f" ± {deviation:,.{digits}f}" if std else ""
+        return f"{mean:,.{digits}f}{spread}{brackets(low, high, digits)}"
 
     return text
-
-
-def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
-    """Makes a text of the columns of `mean_columns`."""
-    return with_interval(f"{name}_mean", name, digits, f"{name}_std" if std else "")
 
 
 def interval_note(of: str) -> str:
@@ -106,13 +101,7 @@ def publish(
     rows = [table.columns, ["---"] * len(table.columns), *table.itertuples(index=False)]
     lines = "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
     text = f"# {title}\n\n`{settings.command()}`\n\n{lines}\n\n{note}\n"
-    write_text(folder / f"{settings.files}table.md", text)
-    printed = Table(*map(str, table.columns), title=title)
-    for row in table.itertuples(index=False):
-        printed.add_row(*map(str, row))
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = 220  # a file has room for whole rows
-    console.print(printed)
+    write_text(folder / "table.md", text)
+    print(f"{title}\n\n{table.to_string(index=False)}\n")
     print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     return table
