@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -201,6 +202,19 @@ def printed(*command, **options):
     done = subprocess.run(command, capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def ended(monkeypatch, capsys, command, *words):
+    """The exit status, the output and the errors of a command of this process."""
+    monkeypatch.setattr(sys, "argv", ["sejax", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    try:
+        command()
+        status = 0
+    except SystemExit as left:
+        status = left.code
+    return status, *capsys.readouterr()
 
 
 def has_compiler():

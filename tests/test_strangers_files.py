@@ -4,13 +4,14 @@ Every command reads one file of each kind that names code: a module that leaves 
 imported, or a function of Python's own that runs a shell command.
 """
 
+import functools
 import sys
 
 import jax
 import numpy as np
 import pytest
 import yaml
-from support import paper_se
+from support import ended, paper_se
 
 import sejax
 from experiments import supervised_baseline
@@ -50,28 +51,18 @@ def refused(monkeypatch, capsys):
     """Runs a command that must end with one message and exit code 2; returns the message."""
 
     def refuse(command, *words):
-        monkeypatch.setattr(sys, "argv", ["command", *map(str, words)])
-        monkeypatch.setattr(sys, "path", list(sys.path))
-        with pytest.raises(SystemExit) as ended:
-            command()
-        said = capsys.readouterr().err
-        assert ended.value.code == commands.BAD_INPUT, said
+        status, _, said = ended(monkeypatch, capsys, command, *words)
+        assert status == commands.BAD_INPUT, said
         assert said.startswith("error: ") and said.count("\n") == 1
         return said
 
     return refuse
 
 
-def run_command():
-    commands.start(run.main, run.help_text)
-
-
-def evaluate_command():
-    commands.start(evaluate.main, evaluate.help_text)
-
-
-def search_command():
-    commands.start(search.main, search.help_text)
+run_command, evaluate_command, search_command = (
+    functools.partial(commands.start, module.main, module.help_text)
+    for module in (run, evaluate, search)
+)
 
 
 def stored(*words, **changes):
@@ -190,11 +181,7 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
 
 
 @pytest.mark.parametrize("foreign", [*PROXIES, {"es": {"name": IMPORTED}}])
-def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys, monkeypatch):
+def test_an_experiment_imports_nothing_that_a_set_names(folder, refused, foreign):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
-    monkeypatch.setattr(sys, "argv", ["supervised_baseline", *words])
-    with pytest.raises(SystemExit) as ended:
-        supervised_baseline.EXPERIMENT.main()
-    said = capsys.readouterr().err
-    assert ended.value.code == commands.BAD_INPUT and said.count("\n") == 1
+    refused(supervised_baseline.EXPERIMENT.main, *words)
