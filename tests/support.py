@@ -1,5 +1,6 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
+import csv
 import functools
 import math
 import os
@@ -16,6 +17,12 @@ from PIL import Image
 from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
+
+# A room of 2 x 2 cells for tables: what takes time is importing and compiling.
+ROOM = [
+    "env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "es.num_incumbent_evals=2",
+    "es.noise_std=1.0", "training.max_steps=30", "training.test_episodes=1", "generations=3",
+]  # fmt: skip
 
 
 def paper_se(**fields):
@@ -183,6 +190,12 @@ def large_ops_in_loops(hlo, num_elements):
             if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
                 found.append((op.group(2), line))
     return [(op, line) for op, line in found if op not in IN_PLACE]
+
+
+def metrics(folder):
+    """The rows of a run, without the one column that depends on the clock."""
+    with (folder / "metrics.csv").open(newline="") as file:
+        return [{k: x for k, x in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
 
 
 def refuse(*_, **__):

@@ -77,14 +77,6 @@ def test_without_overrides_it_is_the_best_cartpole_se():
     assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn-s0"
 
 
-def test_overrides_win_over_presets_and_the_last_one_counts():
-    composed = sejax.config(
-        ["preset=paper", "es.noise_std=0.7", "agent.batch_size=3", "generations=8", "generations=9"]
-    )
-    assert (composed.es.noise_std, composed.agent.batch_size, composed.generations) == (0.7, 3, 9)
-    assert composed.es.step_size == 0.148  # the preset's
-
-
 def test_the_run_directory_names_the_run():
     for overrides, name in [
         (["env=acrobot", "seed=7"], "runs/acrobot-se-ddqn-s7"),
@@ -105,30 +97,6 @@ def test_values_are_read_by_the_types_of_their_fields():
     assert read.generations == 3 and type(read.generations) is int
     assert read.stop_when_solved is True and read.training.max_steps is None
     assert sejax.config(["run_dir=007"]).run_dir == "007"
-
-
-def test_a_configuration_is_read_back_from_its_plain_values():
-    for overrides in (
-        [],
-        ["env=pendulum", "agent=sac"],
-        ["agents=[ddqn,ppo]", "agents.ppo.epochs=3"],
-        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"],
-        ["env=cliff_walking", "proxy=rn"],
-        ["es=snes", "env=gymnax/Catch-bsuite"],
-    ):
-        config = sejax.config(overrides)
-        assert configuration.learn_config(plain(config)) == config
-        assert configuration.completed(plain(config), config) == plain(config)
-
-
-def test_fields_that_an_older_version_did_not_write_are_completed():
-    config = sejax.config(["agents=[ddqn,ppo]"])
-    stored = plain(config)
-    for fields in (stored["es"], stored["training"], stored["agents"]["ddqn"]):
-        fields.popitem()
-    assert configuration.completed(stored, config) == plain(config)
-    foreign = stored | {"proxy": {"name": "mine:Proxy", "size": 3}}  # which is not imported
-    assert configuration.completed(foreign, config) == foreign
 
 
 # --- several agents -------------------------------------------------------------------------------
@@ -232,13 +200,17 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
     "overrides",
     [
         [],
-        ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes"],
-        ["env=gymnax/Catch-bsuite"],
-        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.weight=3"],
+        ["env=pendulum", "agent=sac"],
+        ["env=cliff_walking", "proxy=rn"],
+        ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "agents.ppo.epochs=3"],
+        ["es=snes", "env=gymnax/Catch-bsuite"],
+        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"],
     ],
 )
-def test_a_runs_configuration_is_a_preset_file(tmp_path, overrides):
+def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, overrides):
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
+    assert configuration.learn_config(plain(config)) == config
+    assert configuration.completed(plain(config), config) == plain(config)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(plain(config)))
     preset = f"preset={tmp_path / 'config.yaml'}"
     assert sejax.config([preset]) == config
@@ -273,11 +245,8 @@ def test_a_preset_file_that_is_not_there_is_one_message(tmp_path):
     ("override", "field", "suggested"),
     [
         ("env=cartpol", "env", "env=cartpole"),
-        ("agent=ddqnn", "agent", "agent=ddqn"),
-        ("es=open-es", "es", "es=open_es"),
         ("preset=papers", "preset", "preset=paper"),
         ("es.score_transform=all_beter_2", "es.score_transform", "all_better_2"),
-        ("training.stop_rule=plato", "training.stop_rule", "plateau"),
         ("es.populaton_size=3", "es.populaton_size", "es.population_size"),
         ("generation=3", "generation", "generations"),
         ("agent.batchsize=3", "agent.batchsize", "agent.batch_size"),
@@ -290,34 +259,25 @@ def test_a_preset_file_that_is_not_there_is_one_message(tmp_path):
         (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
         ("foo", "an override", "env=foo"),
         ("=1", "an override", ""),
-        ("lanes=2", "lanes", "num_parallel=2"),
         ("seed=x", "seed", ""),
         ("seed=-1", "seed", ""),
         ("es.population_size=1.5", "es.population_size", ""),
         ("generations.x=1", "generations", "without fields; got generations.x"),
-        ("devices=x", "devices", ""),
         ("es.noise_std=nan", "es.noise_std", ""),
-        ("es.step_size=1e300", "es.step_size", ""),
-        ("es.step_size=5e-324", "es.step_size", ""),
-        ("agent.learning_rate=1e300", "agent.learning_rate", ""),
         ("agent.hidden_size=[1,2]", "agent.hidden_size", ""),
         ("training.max_episodes=null", "training.max_episodes", ""),
         ("stop_when_solved=maybe", "stop_when_solved", ""),
         ("generations=1000000000", "generations", ""),
-        ("generations=0", "generations", ""),
         ("env cartpole", "an override", "Write env=cartpole."),
         ("env = cartpole seed=1", "an override", "Write env=cartpole."),
         ("generations 30", "an override", "Write generations=30."),
         ("env seed=1", "an override", "Write env=VALUE."),
         ("runs/first seed=1", "an override", "proxy=runs/first"),
-        ("agent=PPO", "agent", "Did you mean agent=ppo?"),
         ("agents=[ddqn,ppo", "agents", "close its bracket"),
         ("agents=[ddqn, ppo]", "agents", "Set agents=[ddqn]."),
         ("es.score_transform=my_rank", "es.score_transform", "es.score_transform=rank?"),
         ("es.score_transform=a b:c", "an override", ""),
         ("es.score_transform=rank.py:f", "es.score_transform", "es.score_transform=rank:f."),
-        ("num_parallel=99999999999999999999", "num_parallel", ""),
-        (f"agent={'d' * 5000}", "agent", ""),
         (f"agent=a:{'d' * 5000}", "agent", ""),
         ("agent=no_module_of:mine", "agent", "PYTHONPATH"),
         ("agents=[ddqn,td3_discret]", "agents", "td3_discrete"),

@@ -13,7 +13,6 @@ import gymnax
 import jax
 import pandas as pd
 import pytest
-from rich.console import Console
 from support import is_drawn, paper_se, paper_training, refusal, refused
 
 import sejax
@@ -122,26 +121,15 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, monkeypatch):
-    lines = []
-
-    class Live(progress.Tally):
-        def __init__(self, total, things):
-            lines.append((total, things, []))
-            terminal = Console(file=io.StringIO(), force_terminal=True)
-            super().__init__(total, things, terminal)
-
-        def add(self, count=1):
-            lines[-1][-1].append(count)
-            super().add(count)
-
+    added, add = [], progress.Tally.add
+    monkeypatch.setattr(progress.Tally, "add", lambda self: (added.append(self._total), add(self)))
     words = [f"proxy={room}", "num_agents=3"]
     evaluate(evaluate_config(*words, f"out_dir={tmp_path}/quiet", words=ROOM))
-    monkeypatch.setattr(progress, "Tally", Live)
+    assert not added
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
     evaluate(evaluate_config(*words, f"out_dir={tmp_path}/live", words=ROOM))
     quiet, live = (tmp_path / name / "evaluation.csv" for name in ("quiet", "live"))
-    assert live.read_bytes() == quiet.read_bytes()
-    done = [1, 1, 1]
-    assert lines == [(3, "agents on the proxy", done), (3, "agents on the real task", done)]
+    assert live.read_bytes() == quiet.read_bytes() and added == [3] * 6
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
@@ -154,13 +142,6 @@ def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_p
 def test_agents_train_as_the_proxy_was_learned(evaluated):
     table = pd.read_csv(evaluated[1] / "evaluation.csv")
     assert (table[table.world == "the proxy"].train_steps == 50).all()
-
-
-def test_agents_train_as_configured_if_asked(room, tmp_path):
-    words = ["training_from=config", "training.max_steps=90", "training.stop_rule=never"]
-    overrides = [f"proxy={room}", f"out_dir={tmp_path}", "baseline=false", *words]
-    evaluate(evaluate_config(*overrides, words=ROOM))
-    assert (pd.read_csv(tmp_path / "evaluation.csv").train_steps == 90).all()
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):

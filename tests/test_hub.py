@@ -1,6 +1,5 @@
 """Proxies on the Hugging Face Hub: a server of this process stands for it (`fake_hub.py`)."""
 
-import importlib.util
 import sys
 
 import jax
@@ -12,12 +11,10 @@ from safetensors.numpy import save
 from support import paper_se, refusal, refused
 
 import sejax
+from sejax.options import ConfigError
 from sejax.proxies import header, hub
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
-needs_the_extra = pytest.mark.skipif(
-    importlib.util.find_spec("huggingface_hub") is None, reason="needs pip install 'sejax[hub]'"
-)
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +26,9 @@ def server():
 @pytest.fixture
 def the_hub(server, monkeypatch, tmp_path):
     """An empty Hub, an empty cache, and a user who may write."""
-    from huggingface_hub import constants
-
+    constants = pytest.importorskip(
+        "huggingface_hub.constants", reason="needs pip install 'sejax[hub]'"
+    )
     monkeypatch.setattr(constants, "ENDPOINT", server.url)
     template = f"{server.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
@@ -63,7 +61,9 @@ def test_an_address_names_repository_revision_and_file(address, parts):
     "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
 ])  # fmt: skip
 def test_what_is_no_address_or_no_safetensors_file_is_refused(address):
-    assert refused(hub.parse, address, "proxy") == "proxy"
+    with pytest.raises(ConfigError) as error:
+        hub.parse(address, "proxy")
+    assert error.value.field == "proxy"
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
@@ -75,7 +75,6 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
 # --- what is pushed and loaded -------------------------------------------------------------------
 
 
-@needs_the_extra
 def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
     address = sejax.push("cartpole", "me/my-cartpole", private=True)
     assert address == "hf://me/my-cartpole" and the_hub.private == {"me/my-cartpole": True}
@@ -92,7 +91,6 @@ def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
     np.testing.assert_array_equal(*(env.step(1)[0] for env in envs))
 
 
-@needs_the_extra
 def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, tmp_path):
     env, params = sejax.load("pendulum")
     config = {"agents": {"sac": {"name": "sac"}}}
@@ -112,7 +110,6 @@ def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, 
     assert "What it teaches" not in card and "None" not in card
 
 
-@needs_the_extra
 def test_a_shipped_ones_card_keeps_what_it_teaches(the_hub):
     sejax.push("cliff_walking-rn", "me/rn")
     front, card = front_and_card(the_hub, "me/rn")
@@ -129,7 +126,6 @@ def front_and_card(server, repo):
     return yaml.safe_load(front), card.lstrip()
 
 
-@needs_the_extra
 def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, solved_reward=1.0,
                       max_steps=10)  # fmt: skip
@@ -143,7 +139,6 @@ def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     assert sejax.load(address, task=task)[0].task is task
 
 
-@needs_the_extra
 def test_a_set_is_not_pushed(the_hub, tmp_path):
     env, params = sejax.load("cartpole")
     sejax.save_set(tmp_path / "set.safetensors", env, [params.weights] * 2, [{}, {}])
@@ -151,7 +146,6 @@ def test_a_set_is_not_pushed(the_hub, tmp_path):
     assert not the_hub.commits
 
 
-@needs_the_extra
 def test_a_revision_is_what_was_then_and_none_is_what_is_now(the_hub):
     address = sejax.push("cartpole", "me/se")
     sejax.push("acrobot", "me/se")
@@ -161,7 +155,6 @@ def test_a_revision_is_what_was_then_and_none_is_what_is_now(the_hub):
     assert sejax.load_proxy(f"{address}@main/proxy.safetensors").task.name == "acrobot"
 
 
-@needs_the_extra
 def test_without_a_network_what_was_fetched_before_serves(the_hub, monkeypatch):
     from huggingface_hub import constants
 
@@ -176,7 +169,6 @@ def test_without_a_network_what_was_fetched_before_serves(the_hub, monkeypatch):
 # --- what can go wrong ---------------------------------------------------------------------------
 
 
-@needs_the_extra
 @pytest.mark.parametrize(("address", "said"), [
     ("hf://me/nothing", "no such repository, or it is private"),
     ("hf://me/se@v9", "no such revision"),
@@ -201,7 +193,6 @@ def test_each_failure_is_one_message(the_hub, tmp_path, address, said):
     assert not list(tmp_path.rglob("large.safetensors")), "nothing of it is fetched"
 
 
-@needs_the_extra
 def test_who_may_not_write_is_told(the_hub, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_other")
     assert "hf auth login" in str(refusal(sejax.push, "cartpole", "me/se"))
@@ -216,7 +207,6 @@ def test_a_repository_has_an_owner_and_a_name(repo):
     assert refused(sejax.push, "cartpole", repo) == "repo"
 
 
-@needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     from sejax.cli import config as configuration
     from sejax.cli.worlds import proxy_setup

@@ -86,6 +86,7 @@ FOREIGN = [
     {"proxy": {"name": IMPORTED}},
     {"es": {"name": IMPORTED}},
     {"objective": {"name": IMPORTED}},
+    {"es": {"name": "nes", "score_transform": IMPORTED}},
     {"exploration": {"name": IMPORTED}},
     {"agent": None, "agents": {"ddqn": {"name": IMPORTED, "weight": 1.0}}},
 ]
@@ -112,6 +113,7 @@ PRESETS = [
     {"agents": ["ddqn", "ppo"], "agents.ddqn.name": IMPORTED},
     {"agents": {"ppo": {"name": IMPORTED}}},
     {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
+    {"es.score_transform": IMPORTED},
     {"tracker": IMPORTED},
 ]
 
@@ -130,20 +132,6 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     config = sejax.config(["preset=p.yaml", "env=mine_beside:make"])
     assert config.name("env") == "mine_beside:make" and config.es.noise_std == 0.3
     assert (folder / "typed").exists()
-
-
-TRANSFORM = "strangers_module:make"
-
-
-def test_a_score_transform_that_a_file_names_is_not_imported(folder, refused):
-    words = [*TASK, f"es.score_transform={TRANSFORM}"]
-    config = configuration.plain(sejax.config(words))
-    assert config["es"]["score_transform"] == TRANSFORM  # typed, and imported when it is made
-    (folder / "p.yaml").write_text(f"es.score_transform: {TRANSFORM}\n")
-    said = refused(run_command, *TASK, "preset=p.yaml")
-    assert "es.score_transform must be typed" in said
-    write_proxy({"es": config["es"]})
-    assert sejax.load_proxy("evil.safetensors").env.task.name == "cartpole"
 
 
 STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]
@@ -180,7 +168,7 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
         refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 
-@pytest.mark.parametrize("foreign", [*PROXIES, {"es": {"name": IMPORTED}}])
+@pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"es", "env", "proxy", "agent"} & {*x}])
 def test_an_experiment_imports_nothing_that_a_set_names(folder, refused, foreign):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
