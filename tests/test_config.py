@@ -11,11 +11,12 @@ import yaml
 from support import ended, printed, refusal
 
 import sejax
-from sejax import envs, evaluate, run
+from sejax import distill, envs, evaluate, run
 from sejax.cli import commands, preset_files
 from sejax.cli import config as configuration
 from sejax.cli.compose import expand
 from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, members_of, plain
+from sejax.cli.distill_config import DistillConfig
 from sejax.options import ConfigError, registry
 from sejax.options.plain import flatten, parsed
 
@@ -386,13 +387,14 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
         (run, ["agents=[ddqn,ppo]"], ["agents.ddqn.weight=1.0", "agents.aggregate=mean"]),
         (run, ["agent=ppo"], ["agent.epochs="]),
         (evaluate, [], ["num_agents=10", "real_training.stop_rule=solved"]),
+        (distill, [], ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
     ],
 )
 def test_help_shows_each_field_with_its_value_and_text(module, words, expected):
     said = module.help_text(words)
     for text in expected:
         assert text in said
-    schema = LearnConfig if module is run else EvaluateConfig
+    schema = {run: LearnConfig, evaluate: EvaluateConfig, distill: DistillConfig}[module]
     for field in dataclasses.fields(schema):
         assert field.name in said
 
@@ -409,6 +411,15 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
             budget = config.training.max_episodes * longest
             budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name
+
+
+@pytest.mark.parametrize(
+    ("override", "extra"),
+    [("tracker=wandb", "wandb"), ("tracker=tensorboard", "tensorboard"), ("machines=ray", "ray")],
+)
+def test_a_package_that_is_missing_is_named_before_anything_starts(override, extra, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert f"pip install 'sejax[{extra}]'" in str(refused(override))
 
 
 def test_importing_sejax_imports_nothing_slow_and_touches_nothing():

@@ -167,10 +167,6 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     assert budget_for(training, long, [then], 1, 200).max_episodes == training.max_episodes + 401
     waits = dataclasses.replace(then, warmup_episodes=3)
     assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
-    # That is what an evaluation trains with.
-    setup = proxy_setup(evaluate_config(f"proxy={stored}", "agent.warmup_episodes=3"))
-    used = setup.worlds["the proxy"][2]["ddqn"]
-    assert used.max_steps == 650 and used.stop_rule == training.stop_rule
 
 
 def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):

@@ -344,12 +344,6 @@ def own(monkeypatch):
         del sys.modules[name]
 
 
-def test_parts_of_ones_own_are_chosen_by_overrides(own):
-    assert own.env.size == 4 and own.task().name == "reacher4"
-    assert configuration.learn_config(configuration.plain(own)) == own
-    assert str(own.resolved_run_dir).startswith("runs/own_task_make_reacher-own_proxy_LinearSE-")
-
-
 def test_the_same_parts_as_objects_are_the_same_program(own):
     task = envs.make("own_task:make_reacher", size=4)
     agent, objective = sejax.make_agent(own.agent, task), own.objective.make(task)

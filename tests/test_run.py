@@ -339,18 +339,13 @@ def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, caps
 
 
 def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
-    solving = session.make_chunks(sejax.config([*TINY, "stop_when_solved=true"]))
+    def go(generations, stop):
+        learn(tmp_path, f"generations={generations}", program=(f"stop_when_solved={stop}",))
+        return json.loads((tmp_path / "run.json").read_text())["ended"]
 
-    def go(generations, program):
-        stop = f"stop_when_solved={'true' if program is solving else 'false'}"
-        words = [*TINY, stop, f"generations={generations}", f"run_dir={tmp_path}"]
-        config = sejax.config(words)
-        with run_directory.open_for(config) as directory:
-            return session.run(config, directory, program)
-
-    assert go(6, solving) == "solved" and len(rows(tmp_path)) == 3
-    assert go(6, chunks()) == "finished" and rows(tmp_path) == rows(uninterrupted)
-    assert go(9, solving) == "solved" and rows(tmp_path) == rows(uninterrupted)
+    assert go(6, "true") == "solved" and len(rows(tmp_path)) == 3
+    assert go(6, "false") == "finished" and rows(tmp_path) == rows(uninterrupted)
+    assert go(9, "true") == "solved" and rows(tmp_path) == rows(uninterrupted)
 
 
 def test_an_interrupt_waits_until_files_are_written():

@@ -238,11 +238,6 @@ def test_a_worker_with_other_versions_is_refused():
 # --- the command ---------------------------------------------------------------------------------
 
 
-def test_without_ray_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "pip install 'sejax[ray]'" in str(refusal(sejax.config, ["machines=ray"]))
-
-
 @pytest.mark.parametrize(
     ("words", "field"),
     [
