@@ -1,11 +1,13 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
+import csv
 import functools
 import math
 import os
 import re
 import shutil
 import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -15,6 +17,12 @@ from PIL import Image
 from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
+
+# A room of 2 x 2 cells for tables: what takes time is importing and compiling.
+ROOM = [
+    "env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "es.num_incumbent_evals=2",
+    "es.noise_std=1.0", "training.max_steps=30", "training.test_episodes=1", "generations=3",
+]  # fmt: skip
 
 
 def paper_se(**fields):
@@ -184,6 +192,12 @@ def large_ops_in_loops(hlo, num_elements):
     return [(op, line) for op, line in found if op not in IN_PLACE]
 
 
+def metrics(folder):
+    """The rows of a run, without the one column that depends on the clock."""
+    with (folder / "metrics.csv").open(newline="") as file:
+        return [{k: x for k, x in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
+
+
 def refuse(*_, **__):
     """Stands in for what must not be computed again."""
     raise AssertionError("computed again")
@@ -201,6 +215,19 @@ def printed(*command, **options):
     done = subprocess.run(command, capture_output=True, text=True, **options)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def ended(monkeypatch, capsys, command, *words):
+    """The exit status, the output and the errors of a command of this process."""
+    monkeypatch.setattr(sys, "argv", ["sejax", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    try:
+        command()
+        status = 0
+    except SystemExit as left:
+        status = left.code
+    return status, *capsys.readouterr()
 
 
 def has_compiler():

@@ -15,11 +15,11 @@ from unittest.mock import MagicMock
 
 import jax
 import pytest
+from support import ended, refusal
 
 import sejax
 from sejax import __main__ as program
 from sejax.cli import commands, runtime
-from sejax.options import ConfigError, FailedError
 from sejax.options.plain import expanded
 
 
@@ -45,23 +45,17 @@ def test_devices_are_known_before_anything_is_composed(words, devices):
     assert commands._devices(words) == devices
 
 
-def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, tmp_path):
+def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, capsys, tmp_path):
     shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "stdout", shown)
-    monkeypatch.setattr(sys, "argv", ["run"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(os, "environ", dict(os.environ))
-    commands.start(lambda overrides: print("12.0 ± 4.8"), str)
+
+    def main():
+        commands.start(lambda overrides: print("12.0 ± 4.8"), str)
+
+    ended(monkeypatch, capsys, main)
     shown.flush()
     assert shown.buffer.getvalue() == b"12.0 \\xb1 4.8\n"
-
-
-def test_computing_that_cannot_go_on_is_one_message(capsys):
-    with pytest.raises(SystemExit) as left, commands.messages():
-        raise FailedError("5 workers have failed.")
-    assert left.value.code == commands.FAILED
-    assert capsys.readouterr().err == "error: 5 workers have failed.\n"
 
 
 def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
@@ -78,19 +72,6 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
 # --- what people type ----------------------------------------------------------------------------
 
 
-def ended(monkeypatch, capsys, main, *words):
-    """The exit status and the lines of a command in this process."""
-    monkeypatch.setattr(sys, "argv", ["sejax", *words])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        main()
-        status = 0
-    except SystemExit as left:
-        status = left.code
-    said = capsys.readouterr()
-    return status, (said.out + said.err).splitlines()
-
-
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
@@ -104,27 +85,27 @@ def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys,
     def main():
         commands.start(print, str)
 
-    status, (said,) = ended(monkeypatch, capsys, main, *words)
-    assert status == commands.BAD_INPUT
+    status, _, said = ended(monkeypatch, capsys, main, *words)
+    assert status == commands.BAD_INPUT and said.count("\n") == 1
     assert said.startswith("error: an override must read FIELD=VALUE;") and meant in said
 
 
 @pytest.mark.parametrize("words", [[], ["--help"]])
 def test_without_a_word_the_commands_are_listed_a_line_each(monkeypatch, capsys, words):
-    status, lines = ended(monkeypatch, capsys, program.main, *words)
-    assert status == 0 and len(lines) == len(program.COMMANDS) + 2
+    status, said, _ = ended(monkeypatch, capsys, program.main, *words)
+    assert status == 0 and said.count("\n") == len(program.COMMANDS) + 2
     for name in program.COMMANDS:
-        assert any(line.startswith(f"  {name} ") for line in lines)
+        assert f"\n  {name} " in said
 
 
 @pytest.mark.parametrize(
     ("word", "meant"), [("train", "sejax run."), ("env=cartpole", "sejax run env=cartpole.")]
 )
 def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys, word, meant):
-    status, lines = ended(monkeypatch, capsys, program.main, word)
+    status, _, said = ended(monkeypatch, capsys, program.main, word)
     assert status == commands.BAD_INPUT
-    assert lines[0] == f"error: There is no command {word}. Write {meant}"
-    assert len(lines) == len(program.COMMANDS) + 3
+    assert said.startswith(f"error: There is no command {word}. Write {meant}\n")
+    assert said.count("\n") == len(program.COMMANDS) + 3
 
 
 @pytest.mark.parametrize("name", program.COMMANDS)
@@ -135,7 +116,7 @@ def test_a_command_by_its_word_is_the_module_of_that_name(monkeypatch, capsys, n
     with warnings.catch_warnings(action="ignore"):  # that it has been imported before
         by_word = ended(monkeypatch, capsys, program.main, name, "--help")
         assert ended(monkeypatch, capsys, by_module, "--help") == by_word
-    assert by_word[0] == 0 and len(by_word[1]) > 5
+    assert by_word[0] == 0 and by_word[1].count("\n") > 5
 
 
 def test_an_error_in_code_of_ones_own_ends_with_its_place(monkeypatch, capsys, tmp_path):
@@ -148,10 +129,10 @@ def test_an_error_in_code_of_ones_own_ends_with_its_place(monkeypatch, capsys, t
         with commands.messages():
             my_code.fails(0)
 
-    status, lines = ended(monkeypatch, capsys, main)
-    assert status == commands.FAILED and lines[0].startswith("Traceback")
-    said = "ZeroDivisionError: division by zero (my_code.py:2: return 1 / x)"
-    assert lines[-1] == f"error: code of your own raised {said}"
+    status, _, said = ended(monkeypatch, capsys, main)
+    assert status == commands.FAILED and said.startswith("Traceback")
+    raised = "ZeroDivisionError: division by zero (my_code.py:2: return 1 / x)"
+    assert said.endswith(f"\nerror: code of your own raised {raised}\n")
 
 
 def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
@@ -163,18 +144,16 @@ def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
 
 
 def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
-    left, again = [], []
+    left, again, said = [], [], []
     monkeypatch.setattr(commands, "leave", left.append)
     monkeypatch.setattr(threading, "Timer", lambda *call: again.append(call) or MagicMock())
-    monkeypatch.setattr(sys, "argv", ["run"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(os, "environ", dict(os.environ))
     before = signal.getsignal(signal.SIGTERM)
     for number in (signal.SIGTERM, signal.SIGINT):
-        commands.start(lambda overrides, number=number: signal.raise_signal(number), str)
+        main = functools.partial(commands.start, lambda _, x=number: signal.raise_signal(x), str)
+        said.append(ended(monkeypatch, capsys, main)[1])
     signal.signal(signal.SIGTERM, before)
     assert [call[2] for call in again] == [(os.getpid(), signal.SIGTERM)]
-    assert left == [143, 130] and capsys.readouterr().out == "Interrupted.\n" * 2
+    assert left == [143, 130] and said == ["Interrupted.\n"] * 2
 
 
 @pytest.mark.parametrize("platform", ["cuda", "nonsense"])
@@ -202,11 +181,10 @@ def test_a_mode_of_jax_that_cannot_be_is_one_line_with_its_name(mode, value):
     before = getattr(jax.config, mode)
     jax.config.update(mode, value)
     try:
-        with pytest.raises(ConfigError) as error:
-            runtime.configure_jax()
+        error = refusal(runtime.configure_jax)
     finally:
         jax.config.update(mode, before)
-    assert error.value.field == mode and f"Set {mode.upper()}=" in str(error.value)
+    assert error.field == mode and f"Set {mode.upper()}=" in str(error)
 
 
 def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):

@@ -5,7 +5,6 @@ machine are left alone: ports and folders are our own, and so are the processes 
 """
 
 import contextlib
-import csv
 import importlib.util
 import itertools
 import os
@@ -21,7 +20,7 @@ from pathlib import Path
 
 import pytest
 from safetensors.numpy import load_file
-from support import printed
+from support import metrics, printed
 
 pytestmark = [
     pytest.mark.slow,
@@ -201,14 +200,12 @@ class Driver:
 
 def results(folder):
     """What must not differ: metrics without times, and the proxies' weights."""
-    with (folder / "run" / "metrics.csv").open(newline="") as file:
-        rows = [{k: x for k, x in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
     weights = {
         (name, layer): x.tolist()
         for name in ("proxy", "proxy_last")
         for layer, x in load_file(folder / "run" / f"{name}.safetensors").items()
     }
-    return rows, weights
+    return metrics(folder / "run"), weights
 
 
 @pytest.fixture(scope="module")

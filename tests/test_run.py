@@ -3,7 +3,6 @@
 import csv
 import functools
 import json
-import math
 import os
 import re
 import shutil
@@ -15,27 +14,23 @@ from pathlib import Path
 import jax
 import pytest
 import yaml
-from support import is_drawn
+from support import ROOM, ended, is_drawn
+from support import metrics as rows
 
 import sejax
 from sejax import run
-from sejax.bilevel import Bilevel
 from sejax.cli import commands, run_directory, runtime, session
 from sejax.cli import config as configuration
 from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
 from sejax.cli.trackers import Reporter
-from sejax.options import ConfigError
 
-# A room of 2 x 2 cells for tables: what takes time is importing and compiling.
-TINY = [
-    "env=gridworld_2x2", "agent.learning_rate=0.5", "proxy.hidden_size=4", "es.population_size=2",
-    "es.num_incumbent_evals=2", "es.noise_std=1.0", "training.max_steps=30",
-    "training.test_episodes=1", "generations=3", "seed=12",
-]  # fmt: skip
+OWN = [*ROOM, "seed=12"]
+TINY = [*OWN, "agent.learning_rate=0.5"]
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
 RUN = [sys.executable, "-m", "sejax.run"]
+START = functools.partial(commands.start, run.main, run.help_text, run.config_text)
 
 
 @functools.cache
@@ -63,12 +58,6 @@ def learn(path, *words, program=()):
     return "\n".join(report.said)
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    """Metrics without the one column that depends on the clock."""
-    with (path / "metrics.csv").open(newline="") as file:
-        return [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
-
-
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory) -> Path:
     """A whole run of six generations."""
@@ -83,10 +72,7 @@ def uninterrupted(tmp_path_factory) -> Path:
 def test_a_run_writes_the_files_of_the_design(uninterrupted):
     assert {path.name for path in uninterrupted.iterdir()} == FILES
     assert len(rows(uninterrupted)) == 6
-    header = (uninterrupted / "metrics.csv").read_text().splitlines()[0]
-    assert header == ",".join(COLUMNS)
     stored = yaml.safe_load((uninterrupted / "config.yaml").read_text())
-    assert stored["es"]["population_size"] == 2
     words = ["generations=6", f"run_dir={uninterrupted}"]
     assert configuration.learn_config(stored) == sejax.config([*TINY, *words])
 
@@ -151,24 +137,6 @@ def test_seeds_run_one_after_the_other_on_one_executable(
     assert rows(tmp_path / "seed12") == rows(uninterrupted)
 
 
-def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
-    shared = chunks()
-
-    class Wild(Bilevel):
-        def init(self, key):
-            state = super().init(key)
-            noise_std = state.es_state.noise_std * 1e30
-            return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
-
-    wild = session.Chunks(Wild(**vars(shared.learner)))
-    wild._compiled = shared._compiled
-    config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path}"])
-    with run_directory.open_for(config) as directory:
-        session.run(config, directory, wild)
-    assert [int(row["num_nonfinite"]) for row in rows(tmp_path)] == [4, 4]
-    assert all(math.isfinite(float(row["incumbent_mean"])) for row in rows(tmp_path))
-
-
 # --- trackers ------------------------------------------------------------------------------------
 
 TRACKER = """
@@ -222,7 +190,6 @@ def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path
 # --- families of agents --------------------------------------------------------------------------
 
 FAMILIES = ("agents=[sarsa,q_learning]",)
-OWN = [word for word in TINY if not word.startswith("agent.")]
 
 
 @functools.cache
@@ -273,11 +240,6 @@ def test_a_run_of_families_goes_on_whichever_way_they_are_named(two_families, tm
     proxy = "proxy.safetensors"
     assert (tmp_path / proxy).read_bytes() == (two_families / proxy).read_bytes()
     assert is_drawn(tmp_path / "learning_curve.png")
-
-
-def test_other_families_in_the_same_directory_are_refused(two_families):
-    with pytest.raises(ConfigError, match=r"differs in agents\.sarsa\.weight \(1\.0 there, 2\.0"):
-        learn_families(two_families, *FAMILIES, "agents.sarsa.weight=2")
 
 
 # --- damage --------------------------------------------------------------------------------------
@@ -357,22 +319,14 @@ def test_a_killed_run_goes_on_to_the_same_numbers_with_the_flags_that_users_have
     assert {path.name for path in killed.iterdir()} == FILES
 
 
-def test_ctrl_c_saves_and_exits_130(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
     words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
-    ended = process(sys.executable, "-c", DRIVER, "SIGINT", *words)
-    assert ended.returncode == 130, ended.stderr
-    saved = next(line for line in ended.stdout.splitlines() if "are saved in" in line)
-    assert int(saved.split()[1]) >= 2 and len(rows(tmp_path)) >= 2
-    assert (tmp_path / "proxy.safetensors").exists()
-
-
-def test_sigterm_saves_and_exits_143(tmp_path):
-    words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
-    ended = process(sys.executable, "-c", DRIVER, "SIGTERM", *words)
-    assert ended.returncode == 143, ended.stderr
-    assert "the same command goes on from there" in ended.stdout
-    count = len(rows(tmp_path))
-    assert "Going on at generation" in learn(tmp_path, f"generations={count + 1}")
+    ended = process(sys.executable, "-c", DRIVER, number.name, *words)
+    assert ended.returncode == 128 + number, ended.stderr
+    (count,) = re.findall(r"(\d+) generations are saved in .* goes on from there", ended.stdout)
+    assert int(count) == len(rows(tmp_path)) >= 2 and (tmp_path / "proxy.safetensors").exists()
+    assert f"Going on at generation {count}" in learn(tmp_path, f"generations={int(count) + 1}")
 
 
 def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, capsys):
@@ -385,18 +339,13 @@ def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, caps
 
 
 def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
-    solving = session.make_chunks(sejax.config([*TINY, "stop_when_solved=true"]))
+    def go(generations, stop):
+        learn(tmp_path, f"generations={generations}", program=(f"stop_when_solved={stop}",))
+        return json.loads((tmp_path / "run.json").read_text())["ended"]
 
-    def go(generations, program):
-        stop = f"stop_when_solved={'true' if program is solving else 'false'}"
-        words = [*TINY, stop, f"generations={generations}", f"run_dir={tmp_path}"]
-        config = sejax.config(words)
-        with run_directory.open_for(config) as directory:
-            return session.run(config, directory, program)
-
-    assert go(6, solving) == "solved" and len(rows(tmp_path)) == 3
-    assert go(6, chunks()) == "finished" and rows(tmp_path) == rows(uninterrupted)
-    assert go(9, solving) == "solved" and rows(tmp_path) == rows(uninterrupted)
+    assert go(6, "true") == "solved" and len(rows(tmp_path)) == 3
+    assert go(6, "false") == "finished" and rows(tmp_path) == rows(uninterrupted)
+    assert go(9, "true") == "solved" and rows(tmp_path) == rows(uninterrupted)
 
 
 def test_an_interrupt_waits_until_files_are_written():
@@ -412,43 +361,11 @@ def test_an_interrupt_waits_until_files_are_written():
         signal.signal(signal.SIGINT, before)
 
 
-def command(monkeypatch, *words):
-    """Runs the command in this process; returns its exit status."""
-    monkeypatch.setattr(sys, "argv", ["sejax.run", *words])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    try:
-        commands.start(run.main, run.help_text, run.config_text)
-    except SystemExit as ended:
-        return ended.code
-    return 0
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("env=cartpol", "Did you mean env=cartpole?"),
-        ("es.population_size=1", "es.population_size must be"),
-        ("es.noise_sdt=1", "Did you mean es.noise_std?"),
-        ("devices=x", "devices must be a whole number"),
-        ("generations.x=1", "must be a whole number, without fields; got generations.x"),
-        ("~env=[[1]]", "an override must read"),
-        ("--resolve", "Options: --help, -h, --print-config."),
-    ],
-)
-def test_bad_input_ends_with_one_message_and_status_2(
-    override, message, tmp_path, monkeypatch, capsys
-):
-    assert command(monkeypatch, override, f"run_dir={tmp_path}/run") == 2
-    said = capsys.readouterr().err
-    assert message in said and len(said.strip().splitlines()) == 1
-    assert not (tmp_path / "run").exists()
-
-
 def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypatch, capsys):
     words = [*TINY, f"run_dir={tmp_path}/run", "seed=1,2"]
-    assert command(monkeypatch, *words, "--print-config") == 0
-    printed = [configuration.learn_config(x) for x in yaml.safe_load_all(capsys.readouterr().out)]
-    assert printed == run.configs_of(words) and not (tmp_path / "run").exists()
+    status, said, _ = ended(monkeypatch, capsys, START, *words, "--print-config")
+    printed = [configuration.learn_config(x) for x in yaml.safe_load_all(said)]
+    assert status == 0 and printed == run.configs_of(words) and not (tmp_path / "run").exists()
 
 
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
@@ -477,16 +394,16 @@ def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, m
     monkeypatch.chdir(tmp_path)
     words = [*TINY, "env=my_broken:make", "run_dir=run"]
     for _ in range(2):  # typed again it says the same, and computes nothing
-        assert command(monkeypatch, *words) == commands.FAILED
-        said = capsys.readouterr()
-        assert "All agents of run diverged" in said.err and "Does the task return NaN?" in said.err
-        assert "sejax.evaluate" not in said.out and "sejax.load" not in said.out
+        status, out, err = ended(monkeypatch, capsys, START, *words)
+        assert status == commands.FAILED and err.startswith("error: All agents of run diverged")
+        assert "Does the task return NaN?" in err and err.count("\n") == 1
+        assert "sejax.evaluate" not in out and "sejax.load" not in out
         assert [row["num_nonfinite"] for row in rows(tmp_path / "run")] == ["6"]
         assert not [*(tmp_path / "run").glob("proxy*")]
         assert json.loads((tmp_path / "run" / "run.json").read_text())["ended"] == "diverged"
     sweep = [*TINY, "env=my_broken:make", "env.reward=nan,1.0", "generations=1", "run_dir=sweep"]
-    assert command(monkeypatch, *sweep) == commands.FAILED
-    assert "All agents of sweep/env.reward_nan diverged" in capsys.readouterr().err
+    status, _, err = ended(monkeypatch, capsys, START, *sweep)
+    assert status == commands.FAILED and "All agents of sweep/env.reward_nan diverged" in err
     assert (tmp_path / "sweep" / "env.reward_1.0" / "proxy.safetensors").exists()
 
 
@@ -494,8 +411,8 @@ def test_what_is_said_of_a_task_of_ones_own_can_be_typed(tmp_path, monkeypatch, 
     (tmp_path / "my_room.py").write_text(BROKEN)
     monkeypatch.chdir(tmp_path)
     words = [*TINY, "env=my_room:make", "env.reward=1", "generations=1", "run_dir=run"]
-    assert command(monkeypatch, *words) == 0
-    (line,) = re.findall(r"env, params = (.*)", capsys.readouterr().out)
+    _, said, _ = ended(monkeypatch, capsys, START, *words)
+    (line,) = re.findall(r"env, params = (.*)", said)
     assert line == "sejax.load(\"run\", task=sejax.envs.make(name='my_room:make', reward=1.0))"
     env, _ = eval(line, {"sejax": sejax})
     assert env.task.name == "room"

@@ -4,13 +4,14 @@ Every command reads one file of each kind that names code: a module that leaves 
 imported, or a function of Python's own that runs a shell command.
 """
 
+import functools
 import sys
 
 import jax
 import numpy as np
 import pytest
 import yaml
-from support import paper_se
+from support import ended, paper_se
 
 import sejax
 from experiments import se_histograms
@@ -50,28 +51,18 @@ def refused(monkeypatch, capsys):
     """Runs a command that must end with one message and exit code 2; returns the message."""
 
     def refuse(command, *words):
-        monkeypatch.setattr(sys, "argv", ["command", *map(str, words)])
-        monkeypatch.setattr(sys, "path", list(sys.path))
-        with pytest.raises(SystemExit) as ended:
-            command()
-        said = capsys.readouterr().err
-        assert ended.value.code == commands.BAD_INPUT, said
+        status, _, said = ended(monkeypatch, capsys, command, *words)
+        assert status == commands.BAD_INPUT, said
         assert said.startswith("error: ") and said.count("\n") == 1
         return said
 
     return refuse
 
 
-def run_command():
-    commands.start(run.main, run.help_text)
-
-
-def evaluate_command():
-    commands.start(evaluate.main, evaluate.help_text)
-
-
-def search_command():
-    commands.start(search.main, search.help_text)
+run_command, evaluate_command, search_command = (
+    functools.partial(commands.start, module.main, module.help_text)
+    for module in (run, evaluate, search)
+)
 
 
 def stored(*words, **changes):
@@ -95,6 +86,7 @@ FOREIGN = [
     {"proxy": {"name": IMPORTED}},
     {"es": {"name": IMPORTED}},
     {"objective": {"name": IMPORTED}},
+    {"es": {"name": "nes", "score_transform": IMPORTED}},
     {"exploration": {"name": IMPORTED}},
     {"agent": None, "agents": {"ddqn": {"name": IMPORTED, "weight": 1.0}}},
 ]
@@ -121,6 +113,7 @@ PRESETS = [
     {"agents": ["ddqn", "ppo"], "agents.ddqn.name": IMPORTED},
     {"agents": {"ppo": {"name": IMPORTED}}},
     {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
+    {"es.score_transform": IMPORTED},
     {"tracker": IMPORTED},
 ]
 
@@ -139,20 +132,6 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     config = sejax.config(["preset=p.yaml", "env=mine_beside:make"])
     assert config.name("env") == "mine_beside:make" and config.es.noise_std == 0.3
     assert (folder / "typed").exists()
-
-
-TRANSFORM = "strangers_module:make"
-
-
-def test_a_score_transform_that_a_file_names_is_not_imported(folder, refused):
-    words = [*TASK, f"es.score_transform={TRANSFORM}"]
-    config = configuration.plain(sejax.config(words))
-    assert config["es"]["score_transform"] == TRANSFORM  # typed, and imported when it is made
-    (folder / "p.yaml").write_text(f"es.score_transform: {TRANSFORM}\n")
-    said = refused(run_command, *TASK, "preset=p.yaml")
-    assert "es.score_transform must be typed" in said
-    write_proxy({"es": config["es"]})
-    assert sejax.load_proxy("evil.safetensors").env.task.name == "cartpole"
 
 
 STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]
@@ -189,12 +168,8 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
         refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 
-@pytest.mark.parametrize("foreign", [x for x in PROXIES if "agent" not in x])
-def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys, monkeypatch):
+@pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"es", "env", "proxy", "agent"} & {*x}])
+def test_an_experiment_imports_nothing_that_a_set_names(folder, refused, foreign):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
-    monkeypatch.setattr(sys, "argv", ["se_histograms", *words])
-    with pytest.raises(SystemExit) as ended:
-        se_histograms.EXPERIMENT.main()
-    said = capsys.readouterr().err
-    assert ended.value.code == commands.BAD_INPUT and said.count("\n") == 1
+    refused(se_histograms.EXPERIMENT.main, *words)

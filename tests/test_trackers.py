@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import sejax
 from sejax.cli import trackers
 from sejax.cli.trackers import FinishedGeneration, GuardedTracker, TrackedRun
-from sejax.options import ConfigError
 
 
 class Listener:
@@ -77,12 +75,6 @@ def test_ctrl_c_is_not_taken_for_a_failure(tmp_path):
     tracker = GuardedTracker(Interrupted(), tracked_run(tmp_path), print)
     with pytest.raises(KeyboardInterrupt):
         tracker.on_generation(generation(0))
-
-
-def test_a_package_that_is_missing_is_named_before_anything_starts(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'sejax\[wandb\]'"):
-        sejax.config(["tracker=wandb"])
 
 
 # --- the real ones -------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import bits, printed, refusal, refused
+from support import ROOM, bits, printed, refusal, refused
 
 import sejax
 from sejax.bilevel import make_bilevel
@@ -127,11 +127,6 @@ def test_a_worker_that_fails_ends_the_run(turn):
         evaluated(ray.pool(), 2)
 
 
-def test_a_worker_that_never_starts_is_replaced():
-    ray = Ray(room=1, fate=lambda *turn: (FOREVER if turn == (1, 0) else 1.0, None))
-    assert evaluated(ray.pool(), 2) == [2, 2] and ray.killed == [1]
-
-
 def test_machines_join_while_a_generation_runs():
     ray = Ray(room=1)
 
@@ -200,18 +195,8 @@ def require_equal_numbers(words, generations):
     return state
 
 
-TINY = [
-    "env=gridworld_2x2",
-    "agent=q_learning",
-    "agent.learning_rate=0.5",
-    "proxy.hidden_size=4",
-    "es.population_size=4",
-    "es.num_incumbent_evals=2",
-    "es.noise_std=1.0",
-    "training.max_steps=30",
-    "training.test_episodes=1",
-    "stop_when_solved=true",
-]
+SOLVING = [*ROOM, "es.population_size=4", "stop_when_solved=true"]
+TINY = [*SOLVING, "agent.learning_rate=0.5"]
 
 
 def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
@@ -220,7 +205,7 @@ def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
 
 
 CASES = {
-    "mixture": [*TINY[:1], "agents=[q_learning,sarsa]", *TINY[3:]],
+    "mixture": [*SOLVING, "agents=[q_learning,sarsa]"],
     "batches": ["env=cartpole", "es.population_size=4"],
     "curriculum": [
         *("env=pendulum", "es.population_size=4", "training.max_steps=200"),
@@ -251,11 +236,6 @@ def test_a_worker_with_other_versions_is_refused():
 
 
 # --- the command ---------------------------------------------------------------------------------
-
-
-def test_without_ray_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "pip install 'sejax[ray]'" in str(refusal(sejax.config, ["machines=ray"]))
 
 
 @pytest.mark.parametrize(
