@@ -168,7 +168,7 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
         refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 
-@pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"es", "env", "proxy", "agent"} & {*x}])
+@pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"env", "proxy"} & {*x}])
 def test_an_experiment_imports_nothing_that_a_set_names(folder, refused, foreign):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
