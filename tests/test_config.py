@@ -301,9 +301,6 @@ def test_two_whole_messages():
         ("generation=3", "generation", "generations"),
         ("agent.batchsize=3", "agent.batchsize", "agent.batch_size"),
         ("batch_size=3", "batch_size", "agent.batch_size"),
-        ("agent.init_episodes=3", "agent.init_episodes", "agent.warmup_episodes=3"),
-        ("agent.target_update_rate=0.1", "agent.target_update_rate", "agent.tau=0.1"),
-        ("objective.first_test_steps=9", "objective.first_test_steps", "first_eval_steps=9"),
         ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),  # another agent has it
         ("proxy.name=rn", "proxy.name", "proxy=rn"),
         ("env.goal_reward=-1", "env.goal_reward", "env=cliff_walking"),

@@ -16,7 +16,6 @@ from support import paper_se, refusal
 
 import sejax
 from sejax import envs
-from sejax.cli.config import learn_config
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import header
@@ -148,20 +147,6 @@ def test_shipped_proxies_load(name):
     assert proxy.discount == (1.0 if "policy_return" in proxy.record else own)
     assert {"generation", "seed", "evaluations"} <= proxy.record.keys()
     assert proxy.record.keys() & {"score", "policy_return"}
-
-
-def test_fields_of_older_versions_are_read_by_their_new_names(path, env, weights):
-    agent = {"name": "ddqn", "target_update_rate": 0.25}
-    sejax.save(path, env, weights[0], {"agent": agent}, 0.7)
-    assert sejax.load_proxy(path).learned_with("agent").tau == 0.25
-
-
-def test_fields_that_are_gone_may_have_the_value_that_changes_nothing():
-    stored = sejax.load_proxy("cartpole-distilled").config
-    assert stored["random_generations"] == 0
-    assert learn_config(stored).generations == stored["generations"]
-    error = refusal(learn_config, {**stored, "random_generations": 1})
-    assert error.field == "random_generations"
 
 
 @pytest.mark.slow

@@ -31,7 +31,6 @@ from sejax.options import (
     unknown_name,
 )
 from sejax.options.plain import (
-    RENAMED,
     expanded,
     fields_of,
     flatten,
@@ -301,13 +300,10 @@ def _require_field(
     if any(name == field or name.startswith(f"{field}.") for field in fields):
         return
     group, _, last = name.rpartition(".")
-    today = f"{group}.{RENAMED.get(last, '')}".lstrip(".")
     known = registry.GROUPS[group].built_in if group in registry.GROUPS else ()
     others = [choice for choice in known if last in fields_of(registry.find(group, choice))]
     got = shortened(value)
-    if today in fields:
-        message = f"must be called {today}; got {got}. Set {today}={got}."
-    elif last == "name" and group in chosen:
+    if last == "name" and group in chosen:
         message = f"must be left out; got {got}. Set {group}={got}."
     elif name.startswith("agents.") and "agent" in chosen:
         message = f"must come with a mixture; got {got}. {MIXTURE}"

@@ -27,15 +27,6 @@ from sejax.options import (
 
 T = typing.TypeVar("T")
 
-# Fields that had another name in files of older versions.
-RENAMED = {
-    "init_episodes": "warmup_episodes",
-    "target_update_rate": "tau",
-    "lanes": "num_parallel",
-    "first_test_steps": "first_eval_steps",
-}
-# Fields of older versions that are gone, and their values of no effect, which are left out.
-GONE = {"random_generations": 0}
 MISSING = dataclasses.MISSING
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
@@ -64,8 +55,7 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
     Args:
       cls: a dataclass.
-      values: by the names of its fields, today's or those of `RENAMED`; those left out have their
-        defaults. What `GONE` has may be there too.
+      values: by the names of its fields; those left out have their defaults.
       where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
 
     Raises:
@@ -82,10 +72,7 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         ) from error
     full = {name: f"{where}.{name}".lstrip(".") for name in fields}
     read = {}
-    for stored, value in values.items():
-        if stored not in fields and (f"{where}.{stored}".lstrip("."), value) in GONE.items():
-            continue
-        name = stored if stored in fields else RENAMED.get(stored, stored)
+    for name, value in values.items():
         if name not in fields:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
         read[name] = _read(value, hints[name], full[name], fields[name])
