@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import large_ops_in_loops
+from support import large_ops_in_loops, refused
 
 import sejax
 from sejax.bilevel import make_bilevel, make_learner
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
@@ -176,9 +176,6 @@ def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
     told, wanted = program.tell(state, asked, outcome)
     np.testing.assert_allclose(after.es_state.mean, told.es_state.mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(info.incumbent_mean, wanted.incumbent_mean, rtol=1e-6)
-    whole = outcome.replace(scored_returns=outcome.test_returns)
-    other, _ = program.tell(state, asked, whole)
-    assert not np.allclose(other.es_state.mean, told.es_state.mean, rtol=1e-3)
 
 
 def test_all_generations_run_in_one_executable(one_device):
@@ -299,24 +296,20 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
 
 
 def test_more_devices_than_there_are_is_refused():
-    with pytest.raises(ConfigError) as error:
-        make_learner(tiny(f"devices={jax.device_count() + 1}"))
-    assert error.value.field == "devices"
+    assert refused(make_learner, tiny(f"devices={jax.device_count() + 1}")) == "devices"
 
 
 @pytest.mark.parametrize("part", ["task", "agent", "proxy", "es", "objective"])
 def test_a_name_in_the_place_of_an_object_is_refused(part):
     parts = tiny(words=ROOM).parts()
-    with pytest.raises(ConfigError) as error:
-        make_learner(**parts | {part: "nes"})
-    assert error.value.field == part
+    assert refused(make_learner, **parts | {part: "nes"}) == part
 
 
 @pytest.mark.parametrize("generations", [-1, 0, 1.5, 10**9])
 def test_a_number_of_generations_that_cannot_be_is_refused(generations):
-    with pytest.raises(ConfigError) as error:
-        make_learner(**tiny(words=ROOM).parts(), generations=generations)
-    assert error.value.field == "generations"
+    assert (
+        refused(make_learner, **tiny(words=ROOM).parts(), generations=generations) == "generations"
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import lzma
 import numpy as np
 import pandas as pd
 import pytest
+from support import refused
 from test_experiments import CURVES, RNS, refuse_to_compute
 
 import sejax
@@ -226,9 +227,10 @@ def test_rows_of_other_settings_are_refused():
     rn_curves.require_rows(settings, rows)
     for field, value in {"rns": 4, "bonus_groups": 5, "rows": ("default", "tuned"),
                          "num_agents": 10}.items():  # fmt: skip
-        with pytest.raises(ConfigError) as refused:
-            rn_curves.require_rows(dataclasses.replace(settings, **{field: value}), rows)
-        assert refused.value.field == field
+        assert (
+            refused(rn_curves.require_rows, dataclasses.replace(settings, **{field: value}), rows)
+            == field
+        )
 
 
 def test_intervals_are_over_rns_or_agents_and_need_five_of_them():

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from support import paper_training
+from support import paper_training, refused
 from test_experiments import TINY, TINY_AGENT, save_ses
 
 import sejax
@@ -92,9 +92,7 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     assert stored.scores[1] == pytest.approx(float(result.score))
     with pytest.raises(ConfigError, match=r"agent_hparams.*Set work=DIR"):
         learned(agent_hparams="varied")
-    with pytest.raises(ConfigError) as refused:
-        learned(run=["proxy=rn"])
-    assert refused.value.field == "run.proxy"
+    assert refused(learned, run=["proxy=rn"]) == "run.proxy"
 
 
 def test_a_cost_whose_generation_was_lost_is_written_again(tmp_path):
@@ -236,6 +234,4 @@ def evaluated(env, params, task, training, keys):
 def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
     for field, given in (("varied", {"varied": ses, "fixed": None}),
                          ("env", {"fixed": ses, "env": "acrobot"})):  # fmt: skip
-        with pytest.raises(ConfigError) as refused:
-            run("se_performance", se_performance, tmp_path, **given)
-        assert refused.value.field == field
+        assert refused(run, "se_performance", se_performance, tmp_path, **given) == field

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support import has_compiler, refusal
+from support import assert_equal, has_compiler, refusal
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
@@ -201,21 +201,16 @@ def ant_walks():
     return one, keys, actions, jax.tree.map(lambda *x: np.stack(x), *each)
 
 
-def assert_equal_bits(a, b):
-    for x, y in zip(jax.tree.leaves(jax.device_get(a)), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def test_batches_devices_and_threads_equal_single_walks_to_the_bit(ant_walks):
     one, keys, actions, each = ant_walks
     nested = jax.vmap(jax.vmap(one, (0, None)), (0, None))
     together = jax.jit(nested)(keys.reshape(2, 3), actions)
-    assert_equal_bits(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), together), each)
+    assert_equal(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), together), each)
     spread = spread_over_devices(lambda key: one(key, actions), num_devices=2, num_parallel=1)
-    assert_equal_bits(jax.jit(spread)(keys), each)
+    assert_equal(jax.jit(spread)(keys), each)
     with ThreadPoolExecutor(3) as pool:
         walks = list(pool.map(lambda key: one(key, actions), keys))
-    assert_equal_bits(jax.tree.map(lambda *x: np.stack(x), *map(jax.device_get, walks)), each)
+    assert_equal(jax.tree.map(lambda *x: np.stack(x), *map(jax.device_get, walks)), each)
 
 
 def test_a_walk_goes_on_from_its_state_whatever_was_stepped_between(ant_walks):

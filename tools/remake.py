@@ -37,11 +37,11 @@ class Remade(NamedTuple):
 
 def remake(root: Path) -> list[Remade]:
     """The tables of a project's experiments, made of their rows."""
-    root = root.resolve()
-    paths = sorted((root / "results").rglob("*table.md"))
+    stored = (root / "results").resolve()
+    paths = sorted(stored.rglob("*table.md"))
     with TemporaryDirectory() as folder:
         ignore = shutil.ignore_patterns("*table.md", "*.png")  # what no experiment reads
-        shutil.copytree(root / "results", f"{folder}/results", False, ignore, os.symlink)
+        shutil.copytree(stored, f"{folder}/results", ignore=ignore, copy_function=os.symlink)
         context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork loses
         with ProcessPoolExecutor(mp_context=context) as pool:
             return list(pool.map(report, paths, itertools.repeat(folder)))
