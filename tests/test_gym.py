@@ -2,7 +2,6 @@
 
 import dataclasses
 import pickle
-import subprocess
 import sys
 
 import gymnasium
@@ -509,8 +508,7 @@ if __name__ == "__main__":
     print(envs.reset(seed=0)[0].shape, gymnasium.spec("sejax/cartpole").id)
     envs.close()
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert ended.stdout == "(2, 4) sejax/cartpole\n", ended.stderr
+    assert printed(sys.executable, "-c", program) == "(2, 4) sejax/cartpole\n"
 
 
 @pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from plain_agents import agent_for, learn, mean_return
-from support import refused
+from support import printed, refused
 
 import sejax
 from sejax import envs
@@ -36,9 +35,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_they_are_listed_as_a_table_without_jax():
     program = "import sejax, sys; print(sejax.pretrained()); assert 'jax' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    head, *rows = done.stdout.splitlines()
+    head, *rows = printed(sys.executable, "-c", program).splitlines()
     assert head.split()[:3] == ["name", "kind", "task"]
     assert [row.split()[0] for row in rows] == list(PROXIES)
     assert len({row.index(f" {PROXIES[row.split()[0]].kind} ") for row in rows}) == 1, "a column"
