@@ -16,17 +16,11 @@ from sejax import envs
 from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 from sejax.envs.environment import spaces_of
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
+from sejax.gym import GYMNASIUM_IDS
 from sejax.options import ConfigError, registry
 
 KEY = jax.random.key(0)
-GYMNASIUM_IDS = {
-    "cartpole": "CartPole-v1",
-    "acrobot": "Acrobot-v1",
-    "mountain_car": "MountainCar-v0",
-    "mountain_car_continuous": "MountainCarContinuous-v0",
-    "pendulum": "Pendulum-v1",
-}
-CLASSIC = list(GYMNASIUM_IDS)
+CLASSIC = ["cartpole", "acrobot", "mountain_car", "mountain_car_continuous", "pendulum"]
 CAR = {"position": (-1.2, 0.6), "velocity": (-0.07, 0.07)}
 # Where states are drawn from. CartPole: up to the walls (|x| = 2.4, 12 degrees), so that a step
 # crosses them. Acrobot and the pendulum: all angles and speeds, where clipping and wrapping act.
@@ -141,7 +135,7 @@ OURS = {  # where Gymnasium has no threshold, or other rules
 }
 
 
-@pytest.mark.parametrize("name", [*GYMNASIUM_IDS, *OURS, "cartpole_v1"])
+@pytest.mark.parametrize("name", [*CLASSIC, *OURS, "cartpole_v1"])
 def test_limits_and_thresholds_are_the_papers_and_gymnasiums(name):
     cartpoles = {"cartpole": "CartPole-v0", "cartpole_v1": "CartPole-v1"}
     if name in OURS:

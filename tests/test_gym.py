@@ -131,18 +131,6 @@ def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
     assert assert_equal_steps(env, jax_env, jax_env.params(weights)) > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [x.name for x in sejax.pretrained() if x.kind == "se"])
-def test_shipped_ses_are_the_same(name):
-    """The starts of all are learned, and their episodes have one step."""
-    jax_env, params = sejax.load(name)
-    assert assert_equal_steps(make(name), jax_env, params, num_steps=1000) == 1000
-    keys = jax.random.split(KEY, 100)
-    noise = jax.vmap(lambda key: jax.random.normal(key, (jax_env.task.obs_dim,)))(keys)
-    starts, _ = jax.jit(jax.vmap(jax_env.reset_env, (0, None)))(keys, params)
-    assert_close(make(name).world.first(np.asarray(noise)), starts)
-
-
 @pytest.mark.parametrize("scale", [0.5, 1e4], ids=["usual", "beyond what is absurd"])
 def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale):
     jax_env = jax_se(**BANDIT)

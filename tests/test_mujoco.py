@@ -16,6 +16,7 @@ from support import assert_equal, has_compiler, refusal
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
+from sejax.gym import GYMNASIUM_IDS
 from sejax.ops.parallel import spread_over_devices
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -26,15 +27,7 @@ if not has_compiler():
 from sejax.envs.mujoco import library  # noqa: E402, which imports mujoco
 from sejax.envs.mujoco.physics import of_gymnasium  # noqa: E402
 
-IDS = {
-    "halfcheetah": "HalfCheetah-v5",
-    "hopper": "Hopper-v5",
-    "walker2d": "Walker2d-v5",
-    "swimmer": "Swimmer-v5",
-    "inverted_pendulum": "InvertedPendulum-v5",
-    "ant": "Ant-v5",
-    "reacher": "Reacher-v5",
-}
+IDS = {name: x for name, x in GYMNASIUM_IDS.items() if x.endswith("-v5")}
 NAMES = tuple(IDS)
 # Gymnasium's keyword arguments, other than its defaults.
 OPTIONS = {
@@ -330,24 +323,16 @@ def no_compiler(patch):
     patch.setattr(library, "COMPILERS", ("none-either",))
 
 
-def failing_compiler(patch):
-    patch.setenv("CXX", "sh -c 'echo no standard library >&2; exit 1'")
+def compiler(command):
+    return lambda patch: patch.setenv("CXX", command)
 
 
-def unreadable_compiler(patch):
-    patch.setenv("CXX", "'g++")
+def without_module(name):
+    return lambda patch: patch.setitem(sys.modules, name, None)
 
 
 def unloadable_library(patch):
     patch.setattr(library, "build", lambda path: path.write_text("nothing"))
-
-
-def no_mujoco(patch):
-    patch.setitem(sys.modules, "mujoco", None)
-
-
-def no_gymnasium(patch):
-    patch.setitem(sys.modules, "gymnasium", None)
 
 
 def no_cpu(patch):
@@ -359,11 +344,11 @@ def no_cpu(patch):
     ("without", "said"),
     [
         (no_compiler, "$CXX, none-either"),
-        (failing_compiler, "no standard library"),
-        (unreadable_compiler, "CXX is no command, 'g++"),
+        (compiler("sh -c 'echo no standard library >&2; exit 1'"), "no standard library"),
+        (compiler("'g++"), "CXX is no command, 'g++"),
         (unloadable_library, "SEJAX_CACHE_DIR"),
-        (no_mujoco, "pip install 'sejax[mujoco]'"),
-        (no_gymnasium, "pip install 'sejax[mujoco]'"),
+        (without_module("mujoco"), "pip install 'sejax[mujoco]'"),
+        (without_module("gymnasium"), "pip install 'sejax[mujoco]'"),
         (no_cpu, "JAX_PLATFORMS=cpu"),
     ],
 )

@@ -96,11 +96,6 @@ def test_the_noise_is_normal_with_the_configured_std():
     assert abs((noise**4).mean() - 3) < 5 * np.sqrt(96 / n)  # kurtosis of a normal
 
 
-def test_each_generation_draws_new_noise():
-    first, second = asked(seed=1)[0], asked(seed=2)[0]
-    assert np.abs(first[:3] - second[:3]).min() > 0
-
-
 # --- the sign ------------------------------------------------------------------------------------
 
 
@@ -127,14 +122,15 @@ def test_a_sign_that_diverged_loses_to_one_that_did_not(diverged):
 
 
 def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
-    """Algorithm 1 with mirrored sampling and All Better 2, in plain loops."""
+    """Algorithm 1 with All Better 2, in plain loops."""
     n, repeats = config.population_size, config.num_evals
-    perturbed = scores[: 2 * n * repeats].reshape(2 * n, repeats)
+    num_members = 2 * n if config.mirrored else n
+    perturbed = scores[: num_members * repeats].reshape(num_members, repeats)
     values = perturbed.mean(axis=1) if config.eval_aggregate == "mean" else perturbed.min(axis=1)
-    incumbent = np.mean(scores[2 * n * repeats :])
+    incumbent = np.mean(scores[num_members * repeats :])
     noise, member_scores = [], []
     for i in range(n):
-        plus, minus = values[i], values[n + i]
+        plus, minus = values[i], values[n + i] if config.mirrored else -INF
         eps = candidates[i * repeats] - mean
         noise.append(-eps if minus > plus else eps)
         member_scores.append(max(plus, minus))
@@ -147,11 +143,13 @@ def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
 
 
 @pytest.mark.parametrize("update_rule", ["authors", "paper"])
-@pytest.mark.parametrize("aggregate_by", ["mean", "min"])
-def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
+@pytest.mark.parametrize(
+    ("aggregate_by", "mirrored"), [("mean", True), ("min", True), ("mean", False)]
+)
+def test_generations_equal_a_numpy_loop(update_rule, aggregate_by, mirrored):
     config = NESConfig(
         population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
-        num_incumbent_evals=None,
+        num_incumbent_evals=None, mirrored=mirrored,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
     strategy = config.make(DIMS)
@@ -195,36 +193,6 @@ def test_enormous_noise_that_diverged_leaves_no_trace():
         mean_after([NAN, 1, NAN, NAN, 0, NAN, 0, 0, 0]), candidates[1], rtol=1e-5
     )
     np.testing.assert_array_equal(mean_after([NAN] * 6 + [0, 0, 0]), MEAN)
-
-
-# --- statistics ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mirrored", [True, False])
-@pytest.mark.parametrize("score_transform", ["linear", "all_better_2"])
-def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transform, mirrored):
-    gradient = np.array([3.0, -1.0, 0.5, 0.0, 2.0, -0.2])
-    direction = gradient / np.linalg.norm(gradient)
-    config = NESConfig(
-        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored,
-        num_incumbent_evals=None,
-    )  # fmt: skip
-    strategy = config.make(DIMS)
-    ask, tell = whole_generations(strategy)
-    start = strategy.init(jax.random.key(0), jnp.array(MEAN))
-
-    def step(key):
-        candidates, state = ask(key, start)
-        scores = candidates @ jnp.array(gradient, jnp.float32)
-        return tell(key, candidates, scores, state).mean - MEAN
-
-    steps = np.asarray(jax.jit(jax.vmap(step))(jax.random.split(jax.random.key(1), 2000)))
-    along = steps @ direction
-    across = steps - np.outer(along, direction)
-    # The noise is isotropic, so that the expected step is a multiple of the gradient.
-    error = across.std(axis=0) / np.sqrt(len(steps))
-    assert (np.abs(across.mean(axis=0)) <= 5 * error + 1e-7).all()
-    assert along.mean() > 20 * along.std() / np.sqrt(len(steps))
 
 
 # --- contract of every strategy ------------------------------------------------------------------

@@ -146,47 +146,6 @@ def test_a_training_says_whether_the_limit_is_terminal(limit_is_terminal, monkey
     assert seen == [limit_is_terminal]
 
 
-def q_values(env, weights):
-    """Optimal action values of a grid world with the shaped rewards, by value iteration."""
-    task = env.task
-    num_states, num_actions = task.num_states, task.num_actions
-    params = env.params(weights, GAMMA)
-    _, template = env.reset_env(None, params)
-
-    def one(state, action):
-        world = template.world.replace(index=state)
-        step = env.step_env(None, template.replace(world=world, obs=state), action, params)
-        return step[0], step[2], step[3]
-
-    states, actions = jnp.divmod(jnp.arange(num_states * num_actions), num_actions)
-    next_state, reward, terminated = (
-        np.asarray(x) for x in jax.jit(jax.vmap(one))(states, actions)
-    )
-    values = np.zeros(num_states)
-    for _ in range(300):
-        q = (reward + GAMMA * np.where(terminated, 0, values[next_state])).reshape(-1, num_actions)
-        values = q.max(axis=1)
-    return q
-
-
-def test_a_potential_that_ends_at_zero_leaves_the_optimal_policy_unchanged():
-    env = make_env("cliff_walking", zero_at_terminal=True)
-    weights = jax.tree.map(lambda x: 4 * x, env.init_weights(jax.random.key(6)))
-    nothing = jax.tree.map(jnp.zeros_like, weights)
-    plain, shaped = q_values(env, nothing), q_values(env, weights)
-    potentials = np.array([phi(env, weights, state) for state in range(48)])
-    inside = np.ones(48, bool)
-    inside[37:] = False  # the cliff and the goal are terminal
-    np.testing.assert_allclose(shaped[inside], (plain - potentials[:, None])[inside], atol=1e-3)
-    assert np.ptp(potentials) > 1  # of no small potential
-    best = plain >= plain.max(axis=1, keepdims=True) - 1e-3
-    kept = shaped >= shaped.max(axis=1, keepdims=True) - 1e-3
-    np.testing.assert_array_equal(best[inside], kept[inside])
-    other = q_values(make_env("cliff_walking", "additive_non_potential"), weights)
-    changed = other >= other.max(axis=1, keepdims=True) - 1e-3
-    assert (best[inside] != changed[inside]).any()
-
-
 @pytest.mark.parametrize(("value", "is_number"), [(np.nan, False), (np.inf, False), (1e30, True)])
 def test_an_absurd_reward_ends_the_episode_instead_of_poisoning_the_agent(value, is_number):
     env = make_env("cartpole", "additive_non_potential")
