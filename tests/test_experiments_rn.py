@@ -252,7 +252,6 @@ def test_settings_are_those_of_the_task():
     training = {row: usual.training(row) for row in usual.rows}
     assert training["default"].stop_rule == "never" and training["default"].tests_between == 1
     assert training["varied"].time_limit_is_terminal > training["tuned"].time_limit_is_terminal
-    assert usual.agent("default").learning_rate == 2.5e-4  # the paper's table
     assert usual.agent("tuned") == sejax.config(["env=cartpole", "agent=ddqn"]).agent
     mountain_car = RnPerformance.of(env="mountain_car_continuous")
     assert mountain_car.agent("tuned").rollout_steps == 256

@@ -1,4 +1,4 @@
-"""experiments.common.statistics: against scipy, by simulation, and what is worked out by hand."""
+"""experiments.common.statistics: against scipy, and what is worked out by hand."""
 
 import numpy as np
 import pandas as pd
