@@ -61,26 +61,31 @@ def unraveled(vector, like):
     )
 
 
+def arrays_of(tree):
+    """The leaves of a pytree as NumPy arrays; keys as their data."""
+
+    def plain(x):
+        is_key = isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(x) if is_key else x)
+
+    return [plain(x) for x in jax.tree.leaves(tree)]
+
+
 def assert_close(a, b, **tolerance):
     """The numbers of two pytrees are close."""
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+    for x, y in zip(arrays_of(a), arrays_of(b), strict=True):
         np.testing.assert_allclose(x, y, **tolerance)
 
 
 def assert_equal(a, b):
     """The numbers of two pytrees are the same."""
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+    for x, y in zip(arrays_of(a), arrays_of(b), strict=True):
         np.testing.assert_array_equal(x, y)
 
 
 def bits(tree):
     """The leaves of a pytree as bytes, with their dtypes and shapes; keys as their data."""
-    found = []
-    for leaf in jax.tree.leaves(tree):
-        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-        found.append(f"{leaf.dtype}{array.shape}".encode() + array.tobytes())
-    return found
+    return [f"{x.dtype}{x.shape}".encode() + x.tobytes() for x in arrays_of(tree)]
 
 
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):

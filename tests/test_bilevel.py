@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import large_ops_in_loops
+from support import assert_close, assert_equal, large_ops_in_loops, refused
 
 import sejax
 from sejax.bilevel import make_bilevel, make_learner
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
@@ -70,23 +70,6 @@ def one_device():
 @pytest.fixture(scope="module")
 def room():
     return on_one_device(ROOM)
-
-
-def leaves(tree):
-    """Leaves as NumPy arrays, keys included."""
-    plain = jax.tree.map(
-        lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x,
-        tree,
-    )
-    return [np.asarray(x) for x in jax.tree.leaves(plain)]
-
-
-def assert_equal(a, b, **tolerance):
-    for x, y in zip(leaves(a), leaves(b), strict=True):
-        if tolerance:
-            np.testing.assert_allclose(x, y, **tolerance)
-        else:
-            np.testing.assert_array_equal(x, y)
 
 
 # --- what a generation does ----------------------------------------------------------------------
@@ -176,16 +159,6 @@ def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
     told, wanted = program.tell(state, asked, outcome)
     np.testing.assert_allclose(after.es_state.mean, told.es_state.mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(info.incumbent_mean, wanted.incumbent_mean, rtol=1e-6)
-    whole = outcome.replace(scored_returns=outcome.test_returns)
-    other, _ = program.tell(state, asked, whole)
-    assert not np.allclose(other.es_state.mean, told.es_state.mean, rtol=1e-3)
-
-
-def test_all_generations_run_in_one_executable(one_device):
-    program, _, ((states, _), _) = one_device
-    weak = lambda tree: jax.tree.map(lambda x: x.weak_type, tree)  # noqa: E731
-    after, _ = jax.eval_shape(program.generation, states[0])
-    assert weak(after) == weak(jax.eval_shape(program.init, KEYS[0]))
 
 
 def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
@@ -223,18 +196,18 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
 
 
 def assert_result_equals_run(result, program, states, infos, **tolerance):
-    assert_equal(result.weights, program.unravel(states[-1].best), **tolerance)
-    assert_equal(result.last_weights, program.unravel(states[-1].incumbent), **tolerance)
+    assert_close(result.weights, program.unravel(states[-1].best), **tolerance)
+    assert_close(result.last_weights, program.unravel(states[-1].incumbent), **tolerance)
     history = jax.tree.map(lambda *x: jnp.stack(x), *infos)
-    assert_equal(result.info, history, **tolerance)
+    assert_close(result.info, history, **tolerance)
     assert result.generation == states[-1].best_generation
-    assert_equal(result.score, states[-1].best_score, **tolerance)
+    assert_close(result.score, states[-1].best_score, **tolerance)
 
 
 def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(one_device):
     program, _, ((states, infos), _) = one_device
     result = jax.jit(make_learner(tiny("devices=2")))(KEYS[0])
-    assert_result_equals_run(result, program, states, infos)
+    assert_result_equals_run(result, program, states, infos, rtol=0)
 
 
 def test_a_learner_vmapped_over_keys_equals_separate_runs(room):
@@ -250,8 +223,8 @@ def test_four_lanes_give_the_same_numbers_as_one(room):
     _, _, ((states, infos), _) = room
     program = program_of("devices=1", "num_parallel=4", words=ROOM)
     lane_states, lane_infos = run(*compiled(program, KEYS[0]), 2)
-    assert_equal(lane_states[2], states[2], rtol=1e-4, atol=1e-5)
-    assert_equal(lane_infos, infos[:2], rtol=1e-4, atol=1e-5)
+    assert_close(lane_states[2], states[2], rtol=1e-4, atol=1e-5)
+    assert_close(lane_infos, infos[:2], rtol=1e-4, atol=1e-5)
 
 
 # --- stopping ------------------------------------------------------------------------------------
@@ -299,24 +272,20 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
 
 
 def test_more_devices_than_there_are_is_refused():
-    with pytest.raises(ConfigError) as error:
-        make_learner(tiny(f"devices={jax.device_count() + 1}"))
-    assert error.value.field == "devices"
+    assert refused(make_learner, tiny(f"devices={jax.device_count() + 1}")) == "devices"
 
 
 @pytest.mark.parametrize("part", ["task", "agent", "proxy", "es", "objective"])
 def test_a_name_in_the_place_of_an_object_is_refused(part):
     parts = tiny(words=ROOM).parts()
-    with pytest.raises(ConfigError) as error:
-        make_learner(**parts | {part: "nes"})
-    assert error.value.field == part
+    assert refused(make_learner, **parts | {part: "nes"}) == part
 
 
 @pytest.mark.parametrize("generations", [-1, 0, 1.5, 10**9])
 def test_a_number_of_generations_that_cannot_be_is_refused(generations):
-    with pytest.raises(ConfigError) as error:
-        make_learner(**tiny(words=ROOM).parts(), generations=generations)
-    assert error.value.field == "generations"
+    assert (
+        refused(make_learner, **tiny(words=ROOM).parts(), generations=generations) == "generations"
+    )
 
 
 @pytest.mark.parametrize(
@@ -337,7 +306,7 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     program = program_of(*overrides, words=words)
     state = jax.eval_shape(program.init, KEYS[0])
     after, info = jax.eval_shape(program.generation, state)
-    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)  # noqa: E731
     assert kind(after) == kind(state)
     columns = dict(vars(info))
     assert {x.shape for x in jax.tree.leaves(columns.pop("by_agent"))} == {(1,)}

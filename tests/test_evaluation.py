@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
-from support import paper_se, paper_training
+from support import paper_training
 
 import sejax
 from sejax import envs, evaluation
 from sejax.evaluation import _evaluation_program
-from sejax.options import ConfigError, registry
-from sejax.proxies.configs import RewardConfig
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig
 
 ENV = ScriptedEnv()
@@ -61,32 +60,6 @@ def test_an_outcome_counts_training_and_tests():
     assert diverged.nonfinite and diverged.train_steps == 5
     nothing = evaluate(jax.random.key(0), script([5] * 12, [3] * 12), jnp.bool_(False))
     assert nothing.train_steps == 0 and nothing.real_steps == 0
-
-
-@pytest.mark.parametrize(("env", "agent", "exploration", "varied", "proxy"), [
-    ("pendulum", "td3", "none", False, paper_se(hidden_size=2)),
-    ("pendulum", "td3", "icm", False, RewardConfig(hidden_size=2)),
-    ("pendulum", "sac", "icm", False, paper_se(hidden_size=2)),
-    ("pendulum", "ppo", "icm", False, paper_se(hidden_size=2)),
-    ("cartpole", "td3_discrete", "none", False, paper_se(hidden_size=2)),
-    ("cartpole", "ddqn", "icm", False, RewardConfig(hidden_size=2)),
-    pytest.param("pendulum", "sac", "icm", True, paper_se(hidden_size=2),
-                 marks=pytest.mark.slow),  # which is traced for every size that may be drawn
-    pytest.param("cartpole", "ddqn", "icm", True, RewardConfig(hidden_size=2),
-                 marks=pytest.mark.slow),
-])  # fmt: skip
-def test_every_kind_of_agent_can_be_trained_on_every_kind_of_proxy(
-    env, agent, exploration, varied, proxy
-):
-    task = envs.make(env)
-    config = registry.configure("agent", {"name": agent})
-    bonus = registry.configure("exploration", {"name": exploration})
-    made = sejax.make_agent(config, task, bonus, varied)
-    world = registry.make("proxy", proxy, task)
-    training = TrainingConfig(max_steps=5, max_episodes=5, stop_rule="never", test_episodes=3)
-    evaluate = evaluation.make_evaluator(made, world, task, training)
-    outcome = jax.eval_shape(lambda key: evaluate(key, world.default_params), jax.random.key(0))
-    assert outcome.test_returns.shape == (3,)
 
 
 def test_agents_are_those_that_a_stored_proxy_was_learned_with():

@@ -7,7 +7,6 @@ import pytest
 import sejax
 from experiments import break_even
 from experiments.common import proxy_users
-from experiments.common.experiment import Settings
 from experiments.common.shards import stack
 from sejax import ConfigError
 
@@ -94,7 +93,6 @@ def test_runs_of_nes_keep_their_last_score_when_they_have_ended():
 def test_pilots_have_other_seeds_and_costs_are_those_of_the_card():
     with pytest.raises(ConfigError, match="pilot_seed=4"):
         break_even.BreakEven.of(seed=3, pilot_seed=3)
-    assert issubclass(break_even.BreakEven, Settings)
     known = {name: proxy_users.costs_of(name) for name in break_even.BreakEven.of().proxies}
     for card in sejax.pretrained():
         assert known[card.name]["learning_steps"] == card.learning.real_steps > 0

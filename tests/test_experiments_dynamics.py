@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import t as student
-from support import paper_se, refuse
+from support import paper_se, refuse, refused
 from test_experiments import save_ses
 
 import sejax
@@ -100,16 +100,6 @@ def test_ses_are_found_by_their_task_and_named_by_their_file(tmp_path):
     assert other.set == str(tmp_path / "other") and other.ses.task.name == "acrobot"
 
 
-@pytest.mark.parametrize(
-    ("given", "field"),
-    [({"env": "pendulum", "ses": "cartpole"}, "ses"), ({"margin": 0}, "margin")],
-)  # fmt: skip
-def test_settings_that_cannot_work_are_refused(given, field, tmp_path):
-    with pytest.raises(sejax.ConfigError) as refused:
-        se_myopia.EXPERIMENT.run(se_myopia.SeMyopia.of(out=str(tmp_path), **given))
-    assert refused.value.field == field
-
-
 # --- kinds of SEs ---------------------------------------------------------------------------------
 
 
@@ -175,15 +165,22 @@ def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
 
 
 @pytest.mark.parametrize(
-    ("given", "field"),
-    [({"kinds": ["hard"]}, "kinds"), ({"students": ["dqnn"]}, "students"),
-     ({"students": ["ddqn", "td3"]}, "agent"), ({"margin": 0}, "margin"),
-     ({"max_steps": 100, "kinds": ["soft"]}, "training")],
+    ("page", "given", "field"),
+    [(se_dynamics, {"kinds": ["hard"]}, "kinds"), (se_dynamics, {"students": ["dqnn"]}, "students"),
+     (se_dynamics, {"students": ["ddqn", "td3"]}, "agent"),
+     (se_dynamics, {"margin": 0}, "margin"),
+     (se_dynamics, {"max_steps": 100, "kinds": ["soft"]}, "training"),
+     (se_myopia, {"discounts": [0.9]}, "discounts"),
+     (se_myopia, {"discounts": [0, 1.5]}, "discounts"),
+     (se_myopia, {"env": "pendulum", "ses": "cartpole"}, "ses"),
+     (se_myopia, {"margin": 0}, "margin")],
 )  # fmt: skip
-def test_kinds_and_students_that_cannot_work_are_refused_before_any_run(
-    given, field, tmp_path, monkeypatch
+def test_settings_that_cannot_work_are_refused_before_any_run(
+    page, given, field, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(se_dynamics.runs, "learn", refuse)
-    with pytest.raises(sejax.ConfigError) as refused:
-        se_dynamics.EXPERIMENT.run(se_dynamics.SeDynamics.of(out=str(tmp_path), **given))
-    assert refused.value.field.startswith(field)
+
+    def run():
+        page.EXPERIMENT.run(page.EXPERIMENT.settings.of(out=str(tmp_path), **given))
+
+    assert refused(run).startswith(field)

@@ -156,14 +156,3 @@ def test_a_model_of_theirs_is_a_policy_to_distil(tmp_path, name, task):
         *("devices=1", f"run_dir={tmp_path}/run"),
     ])  # fmt: skip
     assert sejax.load_proxy(tmp_path / "run").record["policy_return"] < 200.1
-
-
-@needs_sb3
-def test_subprocesses_know_the_id_that_names_the_package():
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import SubprocVecEnv
-
-    options = {"vec_env_cls": SubprocVecEnv, "vec_env_kwargs": {"start_method": "spawn"}}
-    envs = make_vec_env("sejax.gym:sejax/cartpole", n_envs=2, **options)
-    assert envs.reset().shape == (2, 4)
-    envs.close()

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from support import has_compiler, refusal
+from support import assert_equal, has_compiler, refusal
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
+from sejax.gym import GYMNASIUM_IDS
 from sejax.ops.parallel import spread_over_devices
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -26,15 +27,7 @@ if not has_compiler():
 from sejax.envs.mujoco import library  # noqa: E402, which imports mujoco
 from sejax.envs.mujoco.physics import of_gymnasium  # noqa: E402
 
-IDS = {
-    "halfcheetah": "HalfCheetah-v5",
-    "hopper": "Hopper-v5",
-    "walker2d": "Walker2d-v5",
-    "swimmer": "Swimmer-v5",
-    "inverted_pendulum": "InvertedPendulum-v5",
-    "ant": "Ant-v5",
-    "reacher": "Reacher-v5",
-}
+IDS = {name: x for name, x in GYMNASIUM_IDS.items() if x.endswith("-v5")}
 NAMES = tuple(IDS)
 # Gymnasium's keyword arguments, other than its defaults.
 OPTIONS = {
@@ -201,21 +194,16 @@ def ant_walks():
     return one, keys, actions, jax.tree.map(lambda *x: np.stack(x), *each)
 
 
-def assert_equal_bits(a, b):
-    for x, y in zip(jax.tree.leaves(jax.device_get(a)), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def test_batches_devices_and_threads_equal_single_walks_to_the_bit(ant_walks):
     one, keys, actions, each = ant_walks
     nested = jax.vmap(jax.vmap(one, (0, None)), (0, None))
     together = jax.jit(nested)(keys.reshape(2, 3), actions)
-    assert_equal_bits(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), together), each)
+    assert_equal(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), together), each)
     spread = spread_over_devices(lambda key: one(key, actions), num_devices=2, num_parallel=1)
-    assert_equal_bits(jax.jit(spread)(keys), each)
+    assert_equal(jax.jit(spread)(keys), each)
     with ThreadPoolExecutor(3) as pool:
         walks = list(pool.map(lambda key: one(key, actions), keys))
-    assert_equal_bits(jax.tree.map(lambda *x: np.stack(x), *map(jax.device_get, walks)), each)
+    assert_equal(jax.tree.map(lambda *x: np.stack(x), *map(jax.device_get, walks)), each)
 
 
 def test_a_walk_goes_on_from_its_state_whatever_was_stepped_between(ant_walks):
@@ -335,24 +323,16 @@ def no_compiler(patch):
     patch.setattr(library, "COMPILERS", ("none-either",))
 
 
-def failing_compiler(patch):
-    patch.setenv("CXX", "sh -c 'echo no standard library >&2; exit 1'")
+def compiler(command):
+    return lambda patch: patch.setenv("CXX", command)
 
 
-def unreadable_compiler(patch):
-    patch.setenv("CXX", "'g++")
+def without_module(name):
+    return lambda patch: patch.setitem(sys.modules, name, None)
 
 
 def unloadable_library(patch):
     patch.setattr(library, "build", lambda path: path.write_text("nothing"))
-
-
-def no_mujoco(patch):
-    patch.setitem(sys.modules, "mujoco", None)
-
-
-def no_gymnasium(patch):
-    patch.setitem(sys.modules, "gymnasium", None)
 
 
 def no_cpu(patch):
@@ -364,11 +344,11 @@ def no_cpu(patch):
     ("without", "said"),
     [
         (no_compiler, "$CXX, none-either"),
-        (failing_compiler, "no standard library"),
-        (unreadable_compiler, "CXX is no command, 'g++"),
+        (compiler("sh -c 'echo no standard library >&2; exit 1'"), "no standard library"),
+        (compiler("'g++"), "CXX is no command, 'g++"),
         (unloadable_library, "SEJAX_CACHE_DIR"),
-        (no_mujoco, "pip install 'sejax[mujoco]'"),
-        (no_gymnasium, "pip install 'sejax[mujoco]'"),
+        (without_module("mujoco"), "pip install 'sejax[mujoco]'"),
+        (without_module("gymnasium"), "pip install 'sejax[mujoco]'"),
         (no_cpu, "JAX_PLATFORMS=cpu"),
     ],
 )

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import refused
 
 import sejax
 from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
 from sejax.es.nes import NESConfig
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
@@ -84,13 +85,6 @@ def test_without_mirroring_there_is_no_minus_half():
     np.testing.assert_array_equal(candidates[3:], np.tile(MEAN, (3, 1)))
 
 
-def test_a_generation_of_the_paper_trains_48_agents():
-    strategy = NESConfig(population_size=16, num_incumbent_evals=None).make(DIMS)
-    assert (strategy.num_evaluations, strategy.evaluations.num_incumbent_evals) == (48, 16)
-    fewer = NESConfig(population_size=16, num_incumbent_evals=5).make(DIMS)
-    assert (fewer.num_evaluations, fewer.evaluations.num_incumbent_evals) == (37, 5)
-
-
 def test_the_noise_is_normal_with_the_configured_std():
     strategy = NESConfig(population_size=50, noise_std=0.05).make(400)
     state = strategy.init(jax.random.key(0), jnp.zeros(400))
@@ -100,11 +94,6 @@ def test_the_noise_is_normal_with_the_configured_std():
     assert abs(noise.mean()) < 5 / np.sqrt(n)
     assert abs(noise.var() - 1) < 5 * np.sqrt(2 / n)
     assert abs((noise**4).mean() - 3) < 5 * np.sqrt(96 / n)  # kurtosis of a normal
-
-
-def test_each_generation_draws_new_noise():
-    first, second = asked(seed=1)[0], asked(seed=2)[0]
-    assert np.abs(first[:3] - second[:3]).min() > 0
 
 
 # --- the sign ------------------------------------------------------------------------------------
@@ -133,14 +122,15 @@ def test_a_sign_that_diverged_loses_to_one_that_did_not(diverged):
 
 
 def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
-    """Algorithm 1 with mirrored sampling and All Better 2, in plain loops."""
+    """Algorithm 1 with All Better 2, in plain loops."""
     n, repeats = config.population_size, config.num_evals
-    perturbed = scores[: 2 * n * repeats].reshape(2 * n, repeats)
+    num_members = 2 * n if config.mirrored else n
+    perturbed = scores[: num_members * repeats].reshape(num_members, repeats)
     values = perturbed.mean(axis=1) if config.eval_aggregate == "mean" else perturbed.min(axis=1)
-    incumbent = np.mean(scores[2 * n * repeats :])
+    incumbent = np.mean(scores[num_members * repeats :])
     noise, member_scores = [], []
     for i in range(n):
-        plus, minus = values[i], values[n + i]
+        plus, minus = values[i], values[n + i] if config.mirrored else -INF
         eps = candidates[i * repeats] - mean
         noise.append(-eps if minus > plus else eps)
         member_scores.append(max(plus, minus))
@@ -153,11 +143,13 @@ def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
 
 
 @pytest.mark.parametrize("update_rule", ["authors", "paper"])
-@pytest.mark.parametrize("aggregate_by", ["mean", "min"])
-def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
+@pytest.mark.parametrize(
+    ("aggregate_by", "mirrored"), [("mean", True), ("min", True), ("mean", False)]
+)
+def test_generations_equal_a_numpy_loop(update_rule, aggregate_by, mirrored):
     config = NESConfig(
         population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
-        num_incumbent_evals=None,
+        num_incumbent_evals=None, mirrored=mirrored,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
     strategy = config.make(DIMS)
@@ -203,36 +195,6 @@ def test_enormous_noise_that_diverged_leaves_no_trace():
     np.testing.assert_array_equal(mean_after([NAN] * 6 + [0, 0, 0]), MEAN)
 
 
-# --- statistics ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mirrored", [True, False])
-@pytest.mark.parametrize("score_transform", ["linear", "all_better_2"])
-def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transform, mirrored):
-    gradient = np.array([3.0, -1.0, 0.5, 0.0, 2.0, -0.2])
-    direction = gradient / np.linalg.norm(gradient)
-    config = NESConfig(
-        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored,
-        num_incumbent_evals=None,
-    )  # fmt: skip
-    strategy = config.make(DIMS)
-    ask, tell = whole_generations(strategy)
-    start = strategy.init(jax.random.key(0), jnp.array(MEAN))
-
-    def step(key):
-        candidates, state = ask(key, start)
-        scores = candidates @ jnp.array(gradient, jnp.float32)
-        return tell(key, candidates, scores, state).mean - MEAN
-
-    steps = np.asarray(jax.jit(jax.vmap(step))(jax.random.split(jax.random.key(1), 2000)))
-    along = steps @ direction
-    across = steps - np.outer(along, direction)
-    # The noise is isotropic, so that the expected step is a multiple of the gradient.
-    error = across.std(axis=0) / np.sqrt(len(steps))
-    assert (np.abs(across.mean(axis=0)) <= 5 * error + 1e-7).all()
-    assert along.mean() > 20 * along.std() / np.sqrt(len(steps))
-
-
 # --- contract of every strategy ------------------------------------------------------------------
 
 
@@ -249,25 +211,6 @@ def test_the_names_are_those_of_evosaxs_classes_and_of_the_registry():
     classes = {algorithm.cls for algorithm in ALGORITHMS.values()}
     assert classes <= set(distribution_based_algorithms)
     assert registry.names("es") == ["nes", *ALGORITHMS]
-
-
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
-    strategy = evosax_strategy(name)
-    state = jax.eval_shape(strategy.init, jax.random.key(0), jnp.array(MEAN))
-    members, asked = jax.eval_shape(strategy.ask, jax.random.key(1), state)
-    assert members.shape == (strategy.population_size, DIMS) == (16, DIMS)
-    assert (strategy.num_evaluations, strategy.evaluations.num_incumbent_evals) == (18, 2)
-    assert jax.eval_shape(strategy.incumbent, asked).shape == (DIMS,)
-    scores = members.update(shape=(16,))
-    incumbent = members.update(shape=())
-    key = jax.random.key(2)
-    after = jax.eval_shape(strategy.tell, key, members, scores, incumbent, asked)
-    assert jax.eval_shape(strategy.incumbent, after).shape == (DIMS,)
-    # A scan carries the state: its structure, shapes and types must not change.
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
-        lambda x: (x.shape, x.dtype), state
-    )
 
 
 @pytest.mark.parametrize("decay", [1.0, 0.5])
@@ -316,9 +259,7 @@ def test_a_strategy_that_remembers_scores_wants_them_in_one_unit():
     assert sejax.make_learner(**{**parts, "es": es})
     for more in (["agents=[q_learning,sarsa]"], ["objective.first_eval_steps=2"]):
         parts = sejax.config(["env=gridworld_2x2", *more]).parts()
-        with pytest.raises(ConfigError) as error:
-            sejax.make_learner(**{**parts, "es": es})
-        assert error.value.field == "es"
+        assert refused(sejax.make_learner, **{**parts, "es": es}) == "es"
 
 
 TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)
@@ -373,15 +314,6 @@ def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
     paper = {"population_size": 16, "num_incumbent_evals": None, "noise_std_decay": 1.0}
     scores = climb(NESConfig(**paper, **fields).make(DIMS), 40)
     assert scores[0] < -1.1 and scores[-1] > -0.1
-
-
-def test_the_incumbent_of_evosax_is_the_mean_at_the_end_of_the_candidates():
-    strategy = evosax_strategy("open_es", num_evals=2)
-    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
-    candidates, state = jax.jit(whole_generations(strategy)[0])(jax.random.key(1), state)
-    assert candidates.shape == (2 * 16 + 2, DIMS)
-    np.testing.assert_array_equal(candidates[:32:2], candidates[1:32:2])
-    np.testing.assert_allclose(candidates[-2:], np.tile(MEAN, (2, 1)), rtol=1e-6)
 
 
 def test_nonfinite_fitness_is_just_worse_than_the_worst():

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from plain_agents import agent_for, learn, mean_return
+from support import printed, refused
 
 import sejax
 from sejax import envs
@@ -22,11 +22,12 @@ from sejax.cli.worlds import proxy_setup
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
+from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
 SES = [name for name, proxy in PROXIES.items() if proxy.kind == "se"]
 DISTILLED = [name for name in SES if PROXIES[name].is_distilled]
-TOOLS = Path(__file__).parents[1] / "tools"
+ROOT = Path(__file__).parents[1]
 
 
 # --- what is said of them ------------------------------------------------------------------------
@@ -34,9 +35,7 @@ TOOLS = Path(__file__).parents[1] / "tools"
 
 def test_they_are_listed_as_a_table_without_jax():
     program = "import sejax, sys; print(sejax.pretrained()); assert 'jax' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    head, *rows = done.stdout.splitlines()
+    head, *rows = printed(sys.executable, "-c", program).splitlines()
     assert head.split()[:3] == ["name", "kind", "task"]
     assert [row.split()[0] for row in rows] == list(PROXIES)
     assert len({row.index(f" {PROXIES[row.split()[0]].kind} ") for row in rows}) == 1, "a column"
@@ -98,12 +97,9 @@ def test_each_rn_says_what_it_cost(name):
     assert sejax.config(shlex.split(learning.command)[3:]).generations == learning.generations
 
 
-def test_the_curves_beside_a_set_tell_what_its_proxies_cost(monkeypatch):
-    monkeypatch.syspath_prepend(TOOLS)
-    import ship_proxy
-
+def test_the_curves_beside_a_set_tell_what_its_proxies_cost():
     stored = "results/reward_networks/cartpole/reward_threshold/exclusive_potential.safetensors"
-    path, proxy = TOOLS.parent / stored, sejax.load_proxy("cartpole-rn")
+    path, proxy = ROOT / stored, sejax.load_proxy("cartpole-rn")
     learning = ship_proxy.learning_of(path, proxy)["learning"]
     assert learning == dataclasses.asdict(PROXIES["cartpole-rn"].learning)
 
@@ -112,18 +108,12 @@ def _fields(values):
     return {name: value for name, value in values.items() if name != "name"}
 
 
-def test_the_page_is_what_the_tool_makes(monkeypatch):
-    monkeypatch.syspath_prepend(TOOLS)
-    import make_zoo
-
+def test_the_page_is_what_the_tool_makes():
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
 
 
 def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
     """If it was tested, with the weights that are shipped: those of a bandit are a policy's."""
-    monkeypatch.syspath_prepend(TOOLS)
-    import make_zoo
-
     cells = {name: make_zoo.row(PROXIES[name], make_zoo.verdicts())["teaches by"]
              for name in PROXIES}  # fmt: skip
     for name, proxy in PROXIES.items():
@@ -143,9 +133,6 @@ def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
 
 
 def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(TOOLS)
-    import ship_proxy
-
     (each, *_) = PROXIES["cartpole"].evaluations
     monkeypatch.setattr(ship_proxy, "evaluate", lambda *_: [dataclasses.asdict(each)])
     monkeypatch.setattr(sys, "argv", ["ship_proxy.py", "cartpole", "mine", "--out", str(tmp_path)])
@@ -164,9 +151,7 @@ def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
     record = {"evaluations": [evaluation | {name: value}]}
     path = tmp_path / "odd.safetensors"
     sejax.save(path, proxy.env, proxy.params.weights, **record)
-    with pytest.raises(sejax.ConfigError) as error:
-        zoo.describe(header.read(path))
-    assert error.value.field == f"record.evaluations.{name}"
+    assert refused(zoo.describe, header.read(path)) == f"record.evaluations.{name}"
 
 
 # --- what they teach -----------------------------------------------------------------------------

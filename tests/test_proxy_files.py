@@ -45,12 +45,6 @@ def path(tmp_path, env, weights):
     return path
 
 
-def assert_same_weights(a, b):
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def rewrite(path, change):
     """The same file, whole and with a right checksum, with other tensors or metadata."""
     tensors, values = unpack(path.read_bytes(), "sejax")
@@ -64,7 +58,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     assert sejax.load_set(path).env is env, "sets share one environment, hence its programs"
     loaded, params = sejax.load(path)
     assert loaded.config == env.config and loaded.default_params is params
-    assert_same_weights(params.weights, weights[0])
+    chex.assert_trees_all_equal(params.weights, weights[0])
     assert params.discount == 0.7
     proxy = sejax.load_proxy(path.parent)  # a folder with it
     assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
@@ -86,11 +80,6 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert refusal(proxy.learned_with, "training").field == "group"
 
 
-def test_no_path_of_the_machine_is_kept(path, env, weights):
-    sejax.save(path, env, weights[0], {"run_dir": "/home/me/run"}, 0.9)
-    assert sejax.load_proxy(path).config["run_dir"] is None
-
-
 @pytest.fixture(scope="module")
 def a_set(tmp_path_factory, env, weights):
     """A file of three proxies."""
@@ -107,7 +96,7 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(a_set, env, weights):
     assert proxies.discount == 0.7 and proxies.records[1]["generation"] == 1
     assert proxies.scores.tolist() == [0.5, 0.9, 0.8] and proxies.seeds.tolist() == [5, 6, 7]
     for proxy, expected, record in zip(proxies, weights, proxies.records, strict=True):
-        assert_same_weights(proxy.params.weights, expected)
+        chex.assert_trees_all_equal(proxy.params.weights, expected)
         assert proxy.record == record and proxy.params.discount == 0.7
     assert refusal(sejax.load, a_set).field == "source"
     assert refusal(sejax.load_set, a_set, option="--ses", kind="se").field == "--ses"
@@ -120,7 +109,7 @@ def test_parts_of_a_set_are_chosen_by_score_and_place(a_set, weights):
     assert proxies[proxies.scores >= 0.8].seeds.tolist() == [6, 7]
     assert proxies[:2].seeds.tolist() == [5, 6]
     chosen = proxies[[2, 0]]
-    assert_same_weights(chosen[0].params.weights, weights[2])
+    chex.assert_trees_all_equal(chosen[0].params.weights, weights[2])
     assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
 
 
@@ -284,7 +273,7 @@ def test_doubles_and_arrays_of_one_number_are_saved_as_floats_and_numbers(path, 
     record = {"score": jnp.float32(0.5), "seed": np.int64(3)}
     sejax.save(path, env, doubles, discount=np.float32(0.5), **record)
     assert sejax.load_proxy(path).record == {"score": 0.5, "seed": 3}
-    assert_same_weights(sejax.load_proxy(path).params.weights, weights[1])
+    chex.assert_trees_all_equal(sejax.load_proxy(path).params.weights, weights[1])
 
 
 def test_tensors_of_types_that_numpy_lacks_are_refused(path):

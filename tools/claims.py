@@ -2,7 +2,6 @@
 
     python -m tools.claims          # make claims: fails for a number that is not what the rows give
     python -m tools.claims write    # makes the tables of results/ again, and writes the documents
-    python -m tools.claims list     # each claim, with its count and the commit of its rows
 
 `docs/claims.yaml` has an entry for each number, and says what an entry looks like.
 """
@@ -11,7 +10,6 @@ import functools
 import io
 import re
 import string
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -31,6 +29,7 @@ from tools import remake
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?%?"
+NAN = r" \[nan, nan\]|\bnan%?"  # an interval that too few values leave unknown, or a mean
 TABLE = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 # What no number is looked for in: generated tables, comments, code, mathematics, addresses.
 HIDDEN = re.compile(
@@ -47,10 +46,6 @@ NAMES = re.compile(
 UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
 FUNCTIONS = {"len": len, "min": min, "max": max, "sum": sum, "round": round, "abs": abs}
 FUNCTIONS |= {each.__name__: each for each in (mean_interval, difference_interval)}
-
-
-class WrongError(ValueError):
-    """A claim or table that its rows do not give."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +67,9 @@ class Claims:
         return remake.remake(self.root)
 
     @functools.cached_property
-    def summaries(self) -> dict[Path, str]:
+    def summaries(self) -> dict[str, str]:
         """The numbers behind each table, by the file that they would be."""
-        return {
-            each.path.with_name(each.path.name.replace("table.md", "summary.csv")): each.summary
-            for each in self.remade
-        }
+        return {str(each.summary_file): each.summary for each in self.remade}
 
     def frame(self, rows: str) -> Any:
         """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, settings."""
@@ -85,21 +77,17 @@ class Claims:
             return sejax.config(rows.split()[1:])
         if rows == "pretrained":
             return pd.DataFrame(
-                [
-                    vars(proxy) | (vars(proxy.learning) if proxy.learning else {}) | vars(each)
-                    for proxy in zoo.pretrained()
-                    for each in proxy.evaluations
-                ]
+                vars(proxy) | vars(proxy.learning) | vars(each)
+                for proxy in zoo.pretrained()
+                for each in proxy.evaluations
             )
         if "*" in rows:
             found = sorted(self.root.glob(rows))
             return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
         rows, _, variant = rows.partition("#")
-        path = self.root.resolve() / rows
-        if path.name.endswith("summary.csv") and path in self.summaries:
-            return pd.read_csv(io.StringIO(self.summaries[path]))
-        if not path.exists():
-            raise WrongError(f"there are no rows {rows}")
+        path = self.root / rows
+        if path.name.endswith("summary.csv"):
+            return pd.read_csv(io.StringIO(self.summaries[rows]))
         if path.suffix == ".json":
             return yaml.safe_load(path.read_text())
         found = read_rows(path)
@@ -128,8 +116,6 @@ class Claims:
         if name.startswith("results/"):
             text = (self.root / name).read_text(encoding="utf-8")
             return [line for line in text.splitlines() if line.startswith("|")]
-        if name not in self.entries.get("tables", {}):
-            raise WrongError("it has no entry")
         table = self.entries["tables"][name]
         made = [table["head"], " | ".join("---" for _ in table["head"].split("|"))]
         for line in table["lines"]:
@@ -137,20 +123,17 @@ class Claims:
                 each: Any = [self.values(line) if "rows" in line else {}]
             else:
                 each = self.selected(line)["rows"].to_dict("records")
-            made += [without_nan(line["cells"].format_map(row)) for row in each]
+            made += [re.sub(NAN, "", line["cells"].format_map(row)) for row in each]
         return [re.sub(" +", " ", f"| {line} |") for line in made]
 
     # --- what the documents say ------------------------------------------------------------------
 
     def documents(self) -> dict[str, str]:
         """The text of each document, by its path."""
-        paths = [*self.root.glob("*.md"), *(self.root / "docs").rglob("*.md")]
-        named = {str(path.relative_to(self.root)): path for path in sorted(paths)}
-        return {
-            name: path.read_text(encoding="utf-8")
-            for name, path in named.items()
-            if "_build" not in name and name not in self.entries.get("generated", ())
-        }
+        paths = sorted([*self.root.glob("*.md"), *self.root.glob("docs/**/*.md")])
+        texts = {str(x.relative_to(self.root)): x.read_text(encoding="utf-8") for x in paths}
+        made = self.entries.get("generated", ())
+        return {name: x for name, x in texts.items() if "_build" not in name and name not in made}
 
     def with_tables(self, text: str) -> str:
         """A document whose tables are what the rows give."""
@@ -158,27 +141,28 @@ class Claims:
             lambda found: "\n".join([found[1], *self.lines(found[2]), "", found[3]]), text
         )
 
-    def pattern(self, entry: Mapping[str, Any], names: Mapping[str, Any]) -> re.Pattern[str]:
-        """An entry's text with any numbers in place of its own, over any line breaks."""
-        parts = []
-        for literal, field, spec, _ in string.Formatter().parse(entry["text"]):
-            parts.append(r"\s+".join(map(re.escape, re.split(r"\s+", literal))))
-            if field is not None:
-                said = format_field(field, spec, names)
-                is_number = re.fullmatch(NUMBER, said)
-                parts.append(f"({NUMBER})" if is_number else f"({re.escape(said)})")
-        return re.compile("".join(parts))
+    def text_of(
+        self, entry: Mapping[str, Any], names: Mapping[str, Any]
+    ) -> tuple[re.Pattern[str], list[str]]:
+        """An entry's text with any numbers, over any line breaks, and the numbers of its rows.
 
-    def said(self, entry: Mapping[str, Any], names: Mapping[str, Any]) -> list[str]:
-        """The entry's numbers as the rows give them, in the order of its text."""
-        fields = string.Formatter().parse(entry["text"])
-        return [format_field(field, spec, names) for _, field, spec, _ in fields if field]
+        Every second group of the pattern is a number; the others are the text between.
+        """
+        parts, said = [], []
+        for literal, field, spec, _ in string.Formatter().parse(entry["text"]):
+            parts.append(f"({loosely(literal)})")
+            if field is not None:
+                said.append(f"{{{field}:{spec}}}".format_map(names))
+                is_number = re.fullmatch(NUMBER, said[-1])
+                parts.append(f"({NUMBER})" if is_number else f"({re.escape(said[-1])})")
+        return re.compile("".join(parts)), said
 
     # --- the check -------------------------------------------------------------------------------
 
     def check(self) -> Iterator[str]:
         """What is wrong, a message each."""
-        yield from remake.check(self.root, self.remade)
+        for made in (made for made in self.remade if made.differs):
+            yield f"{made.path.relative_to(self.root.resolve())} is not what its rows give"
         documents, covering = self.documents(), []
         for name, text in documents.items():
             for found in TABLE.finditer(text):
@@ -190,7 +174,7 @@ class Claims:
         for key, entry in self.entries.get("claims", {}).items():
             try:
                 names = self.values(entry)
-                pattern, said = self.pattern(entry, names), self.said(entry, names)
+                pattern, said = self.text_of(entry, names)
                 entry["count"].format_map(names)
             except Exception as error:  # whatever an expression raises
                 yield f"{key}: {error!r}"
@@ -200,12 +184,9 @@ class Claims:
             if not where:
                 yield f"{key}: no document has its text"
             for name, found in where:
-                if list(found.groups()) != said:
-                    yield f"{name}: {key} says {list(found.groups())}, its rows give {said}"
-        stated = {
-            phrase: re.compile(r"\s+".join(map(re.escape, phrase.split())))
-            for phrase in self.entries.get("stated", {})
-        }
+                if list(found.groups()[1::2]) != said:
+                    yield f"{name}: {key} says {list(found.groups()[1::2])}, its rows give {said}"
+        stated = {x: re.compile(loosely(x)) for x in self.entries.get("stated", {})}
         typed = self.typed()
         for phrase, pattern in stated.items():
             if not any(map(pattern.search, (*documents.values(), *typed.values()))):
@@ -225,60 +206,30 @@ class Claims:
 
     def write(self) -> None:
         """Puts what the rows give into the tables of `results/` and all documents."""
-        remake.write(self.remade)
-        claims = [(entry, self.values(entry)) for entry in self.entries.get("claims", {}).values()]
+        for made in (made for made in self.remade if made.differs):
+            write_text(made.path, made.table)
+            print(f"{made.path} is written.")
+        entries = self.entries.get("claims", {}).values()
+        claims = [self.text_of(entry, self.values(entry)) for entry in entries]
         for name, text in self.documents().items():
             new = self.with_tables(text)
-            for entry, names in claims:
-                put = functools.partial(replaced, said=self.said(entry, names))
-                new = self.pattern(entry, names).sub(put, new)
+            for pattern, said in claims:
+                new = pattern.sub(functools.partial(replaced, said=said), new)
             if new != text:
                 write_text(self.root / name, new)
                 print(f"{name} is written.")
 
-    def list(self) -> None:
-        """Prints each claim with its count, and the commit and date of its rows."""
-        for key, entry in self.entries.get("claims", {}).items():
-            names = self.values(entry)
-            rows = entry["rows"]
-            files = list(rows.values()) if isinstance(rows, dict) else [rows]
-            print(f"{key}: {entry['text'].format_map(names)} ({entry['count'].format_map(names)})")
-            for file in files:
-                print(f"    {file}, {entry.get('made') or self.made(file)}")
 
-    def made(self, rows: str) -> str:
-        """Commit and date at which rows were made: the older of those of rows and of settings.
-
-        Rows are written again when columns move, settings when their format does.
-        """
-        rows = rows.partition("#")[0].replace("summary.csv", "rows.csv.xz")
-        paths = [{"pretrained": "sejax/pretrained"}.get(rows, rows)]
-        paths += [str(path) for path in (self.root / rows).parent.glob("settings.json*")]
-        git = ["git", "-C", str(self.root), "log", "-1", "--format=%ct %h %cs", "--"]
-        found = [
-            subprocess.run([*git, path], capture_output=True, text=True).stdout.strip()
-            for path in paths
-        ]
-        return min(filter(None, found), default="").partition(" ")[2]
-
-
-def format_field(field: str, spec: str | None, names: Mapping[str, Any]) -> str:
-    """A placeholder's text."""
-    return f"{{{field}:{spec or ''}}}".format_map(names)
-
-
-def without_nan(text: str) -> str:
-    """Cells without the intervals that too few values leave unknown."""
-    return re.sub(r" \[nan, nan\]|\bnan%?", "", text)
+def loosely(text: str) -> str:
+    """A pattern that finds a text over any line breaks."""
+    return r"\s+".join(map(re.escape, re.split(r"\s+", text)))
 
 
 def replaced(found: re.Match[str], said: list[str]) -> str:
-    """The text that was found, with these groups."""
-    parts, start = [], found.start()
-    for group, text in enumerate(said, 1):
-        parts += [found.string[start : found.start(group)], text]
-        start = found.end(group)
-    return "".join([*parts, found.string[start : found.end()]])
+    """The text that was found, with these numbers."""
+    texts = list(found.groups())
+    texts[1::2] = said
+    return "".join(texts)
 
 
 def unclaimed(name: str, text: str, covering: Iterable[re.Pattern[str]]) -> Iterator[str]:
@@ -293,9 +244,7 @@ def unclaimed(name: str, text: str, covering: Iterable[re.Pattern[str]]) -> Iter
 def main() -> None:
     """The command."""
     claims = Claims.read(ROOT)
-    if "list" in sys.argv[1:]:
-        claims.list()
-    elif "write" in sys.argv[1:]:
+    if "write" in sys.argv[1:]:
         claims.write()
     wrong = list(claims.check())
     print("\n".join([*wrong, f"docs/claims.yaml: {len(wrong)} wrong"]))

@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import shlex
 import shutil
-from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,9 +19,6 @@ from typing import NamedTuple
 from unittest import mock
 
 from experiments.common import experiment, figures
-from sejax.ops.files import write_text
-
-MADE = ("*table.md", "*.png")  # what no experiment reads; it is made again
 
 
 class Remade(NamedTuple):
@@ -30,20 +26,24 @@ class Remade(NamedTuple):
 
     path: Path  # of the table, `results/.../table.md`
     table: str  # its text
+    summary_file: Path  # of the numbers behind it if it were kept, `results/.../summary.csv`
     summary: str  # its numbers, as CSV
+
+    @property
+    def differs(self) -> bool:
+        """Whether the stored table is not what its rows give."""
+        return self.path.read_text(encoding="utf-8") != self.table
 
 
 def remake(root: Path) -> list[Remade]:
     """The tables of a project's experiments, made of their rows."""
-    root = root.resolve()
-    paths = sorted((root / "results").rglob("*table.md"))
+    stored = (root / "results").resolve()
+    paths = sorted(stored.rglob("*table.md"))
     with TemporaryDirectory() as folder:
-        ignore = shutil.ignore_patterns(*MADE)
-        there = Path(folder, "results")
-        shutil.copytree(root / "results", there, copy_function=os.symlink, ignore=ignore)
-        num_processes = min(len(paths), os.cpu_count() or 1) or 1
+        ignore = shutil.ignore_patterns("*table.md", "*.png")  # what no experiment reads
+        shutil.copytree(stored, f"{folder}/results", ignore=ignore, copy_function=os.symlink)
         context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork loses
-        with ProcessPoolExecutor(num_processes, context) as pool:
+        with ProcessPoolExecutor(mp_context=context) as pool:
             return list(pool.map(report, paths, itertools.repeat(folder)))
 
 
@@ -60,22 +60,6 @@ def report(path: Path, folder: str) -> Remade:
         settings = made.settings.of(**experiment.parse([*words, "from_rows=true"]))
         made.run(settings)
         table = settings.folder / path.name
-        return Remade(path, table.read_text("utf-8"), settings.summary_file.read_text("utf-8"))
-
-
-def differing(made: Iterable[Remade]) -> Iterator[Remade]:
-    """The tables that are not what their rows give."""
-    return (each for each in made if each.path.read_text(encoding="utf-8") != each.table)
-
-
-def check(root: Path, made: Iterable[Remade]) -> Iterator[str]:
-    """A message for each table that is not what its rows give."""
-    for each in differing(made):
-        yield f"{each.path.relative_to(root.resolve())} is not what its rows give"
-
-
-def write(made: Iterable[Remade]) -> None:
-    """Writes those that differ."""
-    for each in differing(made):
-        write_text(each.path, each.table)
-        print(f"{each.path} is written.")
+        summary = settings.summary_file
+        beside = settings.folder / summary.name
+        return Remade(path, table.read_text("utf-8"), beside, summary.read_text("utf-8"))

@@ -30,7 +30,6 @@ from sejax.options.plain import flatten
 from sejax.proxies import header, zoo
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
-WORLDS = {"the proxy": "proxy", "the real task": "real"}
 COSTS = ("generations", "agents", "train_steps", "real_steps", "cpu_s")
 
 
@@ -38,13 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", help="run directory or file of the proxy, or SET#PLACE")
     parser.add_argument("name", help="what sejax.load will call it")
-    parser.add_argument("overrides", nargs="*", help="of sejax.evaluate, such as seed=1")
+    parser.add_argument("overrides", nargs="*", help="of sejax.evaluate, such as num_agents=50")
     parser.add_argument("--agents", default="ddqn", help="kinds of agents, such as ddqn,ppo,sac")
-    parser.add_argument("--num-agents", type=int, default=20, help="of each kind")
-    parser.add_argument(
-        "--hparams", default="default", help="theirs: some of default,varied,as_learned"
-    )
-    parser.add_argument("--baseline", action="store_true", help="as many on the real task")
+    parser.add_argument("--hparams", default="default", help="of default,varied,as_learned")
     parser.add_argument("--out", type=Path, default=header.PRETRAINED_DIR, help="folder; sejax's")
     args = parser.parse_intermixed_args()  # overrides may come after options
     path, _, place = args.run.partition("#")
@@ -134,9 +129,9 @@ def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[st
         agents, choice = list(sejax.load_proxy(path).learned_agents()), []
     words = [
         f"proxy={path}",
-        f"num_agents={args.num_agents}",
+        "num_agents=20",
         f"agent_hparams={hparams}",
-        f"baseline={str(args.baseline).lower()}",
+        "baseline=false",
         f"out_dir={path.parent}",
         *choice,
         *args.overrides,
@@ -147,7 +142,7 @@ def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[st
         {
             "agent": agent,
             "hparams": hparams,
-            "world": WORLDS[world],
+            "world": "proxy" if world == "the proxy" else "real",
             "num_agents": row["num_agents"],
             "return_mean": row["test_return_mean"],
             "return_std": row["test_return_std"],
