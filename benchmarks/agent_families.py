@@ -163,7 +163,7 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     A request without a seed compiles that, and answers with the SE's weights.
     """
-    from sejax.cli.runtime import configure_jax, configure_xla
+    from sejax.runs.runtime import configure_jax, configure_xla
 
     configure_xla(1)
     configure_jax()

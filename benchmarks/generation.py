@@ -134,7 +134,7 @@ def show(result: dict[str, Any]) -> None:
 
 def sejax_side(args: argparse.Namespace) -> None:
     """One generation as a compiled program, always from the same fresh state."""
-    from sejax.cli.runtime import configure_xla
+    from sejax.runs.runtime import configure_xla
 
     num_devices = args.cores if args.side == ALL else 1
     configure_xla(num_devices)

@@ -35,9 +35,9 @@ import numpy as np
 
 import sejax
 from sejax.bilevel import make_bilevel
-from sejax.cli import config as configuration
-from sejax.cli.config import members_of
-from sejax.cli.runtime import configure_jax
+from sejax.runs import config as configuration
+from sejax.runs.config import members_of
+from sejax.runs.runtime import configure_jax
 from sejax.training import TrainingConfig, make_trainer
 
 WIDTHS = (16, 64, 256, 1024, 4096, 16_384)  # agents in one batch

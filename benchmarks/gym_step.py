@@ -120,7 +120,7 @@ def make_env(side: str) -> Any:
 
 def make_gymnax(num_envs: int | None = None) -> Any:
     """gymnax's wrapper for Gymnasium around the SE in JAX."""
-    from sejax.cli.runtime import configure_xla
+    from sejax.runs.runtime import configure_xla
 
     configure_xla(1)
     from gymnax.wrappers import gym

@@ -118,7 +118,7 @@ def serve_gymnasium(args: argparse.Namespace) -> None:
 def serve_sejax(args: argparse.Namespace) -> None:
     """The side of one of sejax's physics."""
     os.sched_setaffinity(0, {args.core})
-    from sejax.cli.runtime import configure_xla
+    from sejax.runs.runtime import configure_xla
 
     configure_xla(1)
     import jax
@@ -139,7 +139,7 @@ def serve_sejax(args: argparse.Namespace) -> None:
 
 def serve_devices(args: argparse.Namespace) -> None:
     """The side that has two devices."""
-    from sejax.cli.runtime import configure_xla
+    from sejax.runs.runtime import configure_xla
 
     configure_xla(2)
     import jax

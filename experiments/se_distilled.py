@@ -23,8 +23,8 @@ from experiments.common.agents import CONTINUOUS, DISCRETE
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
-from sejax.cli import distilling
-from sejax.cli.distill_config import read
+from sejax.distillation import distilling
+from sejax.distillation.config import read
 from sejax.options import each_of
 
 QUICK = (

@@ -38,8 +38,8 @@ from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
 from experiments.common.shards import stack, unstack, write_rows
 from sejax import Task, envs
-from sejax.cli import session
 from sejax.options import each_of, positive
+from sejax.runs import session
 
 # On Pendulum, preset=best has a reward whose best action is known.
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", "proxy.reward_form=network")

@@ -19,8 +19,8 @@ from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
 from experiments.common.statistics import worst_tenth
-from sejax.cli.config import AGENT_HPARAMS
 from sejax.options import one_of, require
+from sejax.runs.config import AGENT_HPARAMS
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach
 # agents to solve a task"; appendix "Discussion on the Feasibility": 40 runs of 200 iterations with

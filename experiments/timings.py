@@ -22,9 +22,9 @@ import pandas as pd
 import sejax
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
-from sejax.cli import session
-from sejax.cli.runtime import available_cores
 from sejax.options import each_of
+from sejax.runs import session
+from sejax.runs.runtime import available_cores
 
 PAPER_CORES = 16
 

@@ -53,8 +53,8 @@ _EXPORTS = {
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
     "agent_of": "sejax.proxies.io",
-    "config": "sejax.cli.config",
-    "configure_xla": "sejax.cli.runtime",
+    "config": "sejax.runs.config",
+    "configure_xla": "sejax.runs.runtime",
     "evaluate_agents": "sejax.evaluation",
     "load": "sejax.proxies.io",
     "load_proxy": "sejax.proxies.io",
@@ -85,8 +85,6 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.bilevel import LearnResult, make_learner
-    from sejax.cli.config import config
-    from sejax.cli.runtime import configure_xla
     from sejax.envs.base import Task
     from sejax.es.base import Evaluations, Strategy
     from sejax.es.evosax import EvosaxConfig
@@ -110,6 +108,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
+    from sejax.runs.config import config
+    from sejax.runs.runtime import configure_xla
     from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
 
 __all__ = [

@@ -3,8 +3,8 @@
 import runpy
 import sys
 
-from sejax.cli import commands
 from sejax.options import nearest, shortened
+from sejax.runs import commands
 
 COMMANDS = {
     "run": "learn an SE or a reward network for a task: sejax run env=cartpole",

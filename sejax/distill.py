@@ -3,13 +3,13 @@
 import shlex
 from collections.abc import Sequence
 
-from sejax.cli import commands, runtime
-from sejax.cli.distill_config import DistillConfig, folder_of, read
+from sejax.distillation.config import DistillConfig, folder_of, read
 from sejax.distillation.policy_copy import CopyConfig
 from sejax.distillation.policy_search import SearchConfig
 from sejax.ops.files import FolderLock
 from sejax.options import as_text, help_texts, require
 from sejax.options.plain import fields_of, flatten, to_plain
+from sejax.runs import commands, runtime
 
 ABOUT = """Make an SE of a policy, and choose it by what it teaches.
 
@@ -31,7 +31,7 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides that cannot be, or a folder of another search.
       OSError: if a file cannot be written.
     """
-    from sejax.cli import distilling
+    from sejax.distillation import distilling
 
     own, config = read(overrides)
     runtime.configure_jax()

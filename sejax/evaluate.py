@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from sejax.agents import make_agent
-from sejax.cli import commands, compose, runtime
-from sejax.cli import config as configuration
-from sejax.cli.config import EvaluateConfig, MixtureMember
-from sejax.cli.worlds import Setup, proxy_setup, real_setup
 from sejax.ops.files import require_writable, write_text
+from sejax.runs import commands, compose, runtime
+from sejax.runs import config as configuration
+from sejax.runs.config import EvaluateConfig, MixtureMember
+from sejax.runs.worlds import Setup, proxy_setup, real_setup
 
 if TYPE_CHECKING:  # which takes 0.3 s to import
     import pandas as pd
@@ -80,7 +80,7 @@ def evaluate(config: EvaluateConfig) -> float:
     """
     import pandas as pd
 
-    from sejax.cli import plots
+    from sejax.runs import plots
 
     setup = real_setup(config) if config.proxy == "real" else proxy_setup(config)
     out_dir = setup.out_dir
@@ -108,8 +108,8 @@ def _train_and_test(
     import jax
     import pandas as pd
 
-    from sejax.cli.progress import Tally
     from sejax.evaluation import evaluate_agents
+    from sejax.runs.progress import Tally
 
     env, env_params, trainings = setup.worlds[world]
     varied = config.agent_hparams == "varied"

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 import yaml
 
-from sejax.cli import commands, compose, runtime
-from sejax.cli import config as configuration
-from sejax.cli.config import LearnConfig
-from sejax.cli.progress import RunProgress
-from sejax.cli.run_directory import open_for
 from sejax.options import FailedError
+from sejax.runs import commands, compose, runtime
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
+from sejax.runs.progress import RunProgress
+from sejax.runs.run_directory import open_for
 
 ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
 real dynamics (proxy=rn), from agents trained on nothing else.
@@ -105,7 +105,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                 try:
                     if compiled is None:
                         progress.status("importing jax and the task")
-                    from sejax.cli import session
+                    from sejax.runs import session
 
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from sejax.cli import commands, runtime
 from sejax.options import ConfigError
+from sejax.runs import commands, runtime
 
 if TYPE_CHECKING:
-    from sejax.cli.search_config import Search
+    from sejax.searching.config import Search
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -23,7 +23,8 @@ def main(overrides: Sequence[str]) -> None:
     """
     if find_spec("optuna") is None:
         raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
-    from sejax.cli import search_config, search_results
+    from sejax.searching import config as search_config
+    from sejax.searching import results as search_results
 
     search = search_config.read(overrides)
     try:
@@ -49,9 +50,20 @@ def _study(search: "Search") -> tuple[str, list[str]]:
       The command that repeats the best trial, and the overrides of its settings; none if no trial
       was completed.
     """
-    from sejax.cli import search_config, search_results, search_workers, study
-    from sejax.cli.trials import runner_of
-    from sejax.cli.workers import RayConfig
+    from sejax.runs.workers import RayConfig
+    from sejax.searching import (
+        config as search_config,
+    )
+    from sejax.searching import (
+        results as search_results,
+    )
+    from sejax.searching import (
+        study,
+    )
+    from sejax.searching import (
+        workers as search_workers,
+    )
+    from sejax.searching.trials import runner_of
 
     runner = runner_of(search)
     current = search_config.require_fields(search, runner.config([]))
@@ -81,7 +93,7 @@ def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     if find_spec("optuna") is None:
         return f"{__doc__}\nIt needs pip install 'sejax[search]'."
-    from sejax.cli import search_config
+    from sejax.searching import config as search_config
 
     return search_config.help_text()
 

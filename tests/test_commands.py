@@ -19,8 +19,8 @@ from support import ended, refusal
 
 import sejax
 from sejax import __main__ as program
-from sejax.cli import commands, runtime
 from sejax.options.plain import expanded
+from sejax.runs import commands, runtime
 
 
 def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
@@ -62,7 +62,7 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     script = "import os, sys; os.rmdir(os.getcwd()); sys.argv = ['run']; " \
-             "from sejax.cli import commands; commands.start(print, str)"  # fmt: skip
+             "from sejax.runs import commands; commands.start(print, str)"  # fmt: skip
     done = subprocess.run([sys.executable, "-c", script], cwd=gone, capture_output=True, text=True)
     assert done.returncode == commands.FAILED
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1

@@ -1,4 +1,4 @@
-"""sejax.cli.config: overrides become a configuration; what cannot be is one short message."""
+"""sejax.runs.config: overrides become a configuration; what cannot be is one short message."""
 
 import dataclasses
 import functools
@@ -12,13 +12,13 @@ from support import ended, printed, refusal
 
 import sejax
 from sejax import distill, envs, evaluate, run
-from sejax.cli import commands, preset_files
-from sejax.cli import config as configuration
-from sejax.cli.compose import expand
-from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, members_of, plain
-from sejax.cli.distill_config import DistillConfig
+from sejax.distillation.config import DistillConfig
 from sejax.options import ConfigError, registry
 from sejax.options.plain import flatten, parsed
+from sejax.runs import commands, preset_files
+from sejax.runs import config as configuration
+from sejax.runs.compose import expand
+from sejax.runs.config import EvaluateConfig, LearnConfig, evaluate_config, members_of, plain
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")

@@ -99,7 +99,7 @@ def test_the_wheel_is_the_package_as_git_has_it(wheel):
     package = {name: x for name, x in wheel.items() if ".dist-info/" not in name}
     assert set(package) == of_git("sejax")
     assert all((ROOT / name).read_bytes() == x for name, x in package.items())
-    assert {"sejax/envs/mujoco/step.cc", "sejax/cli/presets/cartpole-se.yaml", "sejax/py.typed",
+    assert {"sejax/envs/mujoco/step.cc", "sejax/presets/cartpole-se.yaml", "sejax/py.typed",
             "sejax/pretrained/cartpole.safetensors"} < set(package)  # fmt: skip
 
 

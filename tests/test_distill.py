@@ -11,9 +11,9 @@ import pytest
 from support import refusal, refused
 
 import sejax
-from sejax.cli import distilling
-from sejax.cli.distill_config import folder_of, read
 from sejax.distill import main
+from sejax.distillation import distilling
+from sejax.distillation.config import folder_of, read
 from sejax.ops import checksummed
 from sejax.options import ConfigError
 from sejax.proxies import header, zoo

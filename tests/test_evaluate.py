@@ -17,15 +17,15 @@ from support import is_drawn, paper_se, paper_training, refusal, refused
 import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import config as configuration
-from sejax.cli import plots, progress
-from sejax.cli.config import members_of
-from sejax.cli.worlds import proxy_setup
 from sejax.evaluate import evaluate, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.ops.files import require_writable
 from sejax.options import registry
+from sejax.runs import config as configuration
+from sejax.runs import plots, progress
+from sejax.runs.config import members_of
+from sejax.runs.worlds import proxy_setup
 from sejax.training import budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",

@@ -25,9 +25,9 @@ from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax import envs
-from sejax.cli import config as configuration
-from sejax.cli import session
 from sejax.options import ConfigError, each_of
+from sejax.runs import config as configuration
+from sejax.runs import session
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
          if module.name not in ("__main__", "common")]  # fmt: skip

@@ -18,8 +18,8 @@ from experiments.common.statistics import mean_interval
 from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_objectives import RnObjectives
 from experiments.rn_performance import RnPerformance
-from sejax.cli import session
 from sejax.options import ConfigError
+from sejax.runs import session
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from experiments.common.statistics import (
     mean_interval,
 )
 from sejax import envs
-from sejax.cli import config as configuration
 from sejax.options import ConfigError
+from sejax.runs import config as configuration
 
 
 @pytest.fixture(scope="module")

@@ -208,8 +208,8 @@ def test_a_repository_has_an_owner_and_a_name(repo):
 
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
-    from sejax.cli import config as configuration
-    from sejax.cli.worlds import proxy_setup
+    from sejax.runs import config as configuration
+    from sejax.runs.worlds import proxy_setup
 
     sejax.push("cartpole", "me/se")
     config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])

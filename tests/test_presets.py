@@ -1,4 +1,4 @@
-"""sejax.cli.presets: the settings that were published are the paper's, number for number."""
+"""sejax.presets: the settings that were published are the paper's, number for number."""
 
 import dataclasses
 import functools
@@ -8,8 +8,8 @@ import pytest
 import sejax
 from experiments.common.reward_networks import STUDIES
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import preset_files
 from sejax.options import ConfigError, registry
+from sejax.runs import preset_files
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")

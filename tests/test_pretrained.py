@@ -16,12 +16,12 @@ from support import printed, refused
 
 import sejax
 from sejax import envs
-from sejax.cli.config import evaluate_config
-from sejax.cli.distill_config import read
-from sejax.cli.worlds import proxy_setup
+from sejax.distillation.config import read
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
+from sejax.runs.config import evaluate_config
+from sejax.runs.worlds import proxy_setup
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}

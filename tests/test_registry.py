@@ -18,8 +18,8 @@ from support import refused as field_of
 import sejax
 from sejax import envs
 from sejax.agents import AgentConfig
-from sejax.cli import config as configuration
 from sejax.options import registry
+from sejax.runs import config as configuration
 
 EVERY = [(group, name) for group in registry.GROUPS for name in registry.GROUPS[group].built_in]
 EXAMPLES = Path(__file__).parents[1] / "examples"

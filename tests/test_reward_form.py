@@ -7,9 +7,9 @@ import pytest
 
 import sejax
 from sejax import envs
-from sejax.cli import config as configuration
 from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
+from sejax.runs import config as configuration
 
 FORMS = {
     form: SyntheticConfig(

@@ -19,11 +19,11 @@ from support import metrics as rows
 
 import sejax
 from sejax import run
-from sejax.cli import commands, run_directory, runtime, session
-from sejax.cli import config as configuration
-from sejax.cli.progress import RunProgress
-from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
-from sejax.cli.trackers import Reporter
+from sejax.runs import commands, run_directory, runtime, session
+from sejax.runs import config as configuration
+from sejax.runs.progress import RunProgress
+from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
+from sejax.runs.trackers import Reporter
 
 OWN = [*ROOM, "seed=12"]
 TINY = [*OWN, "agent.learning_rate=0.5"]
@@ -274,7 +274,7 @@ def test_seconds_do_not_follow_the_machines_clock(uninterrupted, tmp_path, monke
 # test run may be, ignore Ctrl-C, and the processes that they start do too.
 DRIVER = """
 import os, runpy, signal, sys, threading
-from sejax.cli import progress
+from sejax.runs import progress
 
 number = signal.Signals[sys.argv.pop(1)]
 signal.signal(signal.SIGINT, signal.default_int_handler)

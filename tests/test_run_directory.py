@@ -20,10 +20,10 @@ import yaml
 from support import bits, printed, refusal
 
 import sejax
-from sejax.cli.run_directory import COLUMNS, RunDirectory, open_for
 from sejax.ops import checksummed
 from sejax.ops.files import atomic_path
 from sejax.options import ConfigError
+from sejax.runs.run_directory import COLUMNS, RunDirectory, open_for
 
 CONFIG = {
     "seed": 7,
@@ -168,7 +168,7 @@ def test_numbers_read_back_as_the_same_float32_or_integer(tmp_path):
 
 def test_a_column_that_an_older_version_did_not_write_is_nan(run, monkeypatch):
     newer = (*COLUMNS, "novelty")
-    monkeypatch.setattr("sejax.cli.run_directory.COLUMNS", newer)
+    monkeypatch.setattr("sejax.runs.run_directory.COLUMNS", newer)
     with open_run(run) as directory:
         directory.save(state_after(6), info_of(5, 1, novelty=np.array([1.5])), 1.0, 1.0)
     lines = [line.split(",") for line in (run / "metrics.csv").read_text().splitlines()]
@@ -319,7 +319,7 @@ def test_fields_that_change_no_number_may_change(run):
 
 def test_a_refusal_does_not_import_jax(run):
     code = (
-        "import sys; from sejax.cli.run_directory import RunDirectory\n"
+        "import sys; from sejax.runs.run_directory import RunDirectory\n"
         f"try: RunDirectory({str(run)!r}, {{'seed': 3}})\n"
         "except ValueError as error: print(error)\n"
         "assert 'jax' not in sys.modules"
@@ -435,7 +435,7 @@ def test_a_checkpoint_is_on_the_disk_before_it_takes_its_name(run, monkeypatch):
 
 HOLD = """
 import sys
-from sejax.cli.run_directory import RunDirectory
+from sejax.runs.run_directory import RunDirectory
 directory = RunDirectory(sys.argv[1], {"seed": 0})
 print("held", flush=True)
 sys.stdin.readline()

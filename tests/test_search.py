@@ -23,9 +23,11 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
-from sejax.cli import config as configuration  # noqa: E402
-from sejax.cli import search_config, search_results, study, trials  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
+from sejax.runs import config as configuration  # noqa: E402
+from sejax.searching import config as search_config  # noqa: E402
+from sejax.searching import results as search_results  # noqa: E402
+from sejax.searching import study, trials  # noqa: E402
 
 SPACE = "es.noise_std=interval(0.1, 0.9)"
 ONE = ("min_generations=1", "max_generations=1", "pruner=none")

@@ -13,9 +13,10 @@ from optuna.distributions import (
 from support import refusal, refused
 
 import sejax
-from sejax.cli import config as configuration
-from sejax.cli import search_config, spaces
 from sejax.options.plain import to_plain
+from sejax.runs import config as configuration
+from sejax.searching import config as search_config
+from sejax.searching import spaces
 
 
 @pytest.mark.parametrize(

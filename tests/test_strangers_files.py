@@ -16,12 +16,13 @@ from support import ended, paper_se
 import sejax
 from experiments import se_histograms
 from sejax import evaluate, run, search
-from sejax.cli import commands, study
-from sejax.cli import config as configuration
-from sejax.cli import search_config as settings
-from sejax.cli.run_directory import columns_of
 from sejax.ops import checksummed
 from sejax.options import registry
+from sejax.runs import commands
+from sejax.runs import config as configuration
+from sejax.runs.run_directory import columns_of
+from sejax.searching import config as settings
+from sejax.searching import study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]

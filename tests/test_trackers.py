@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sejax.cli import trackers
-from sejax.cli.trackers import FinishedGeneration, GuardedTracker, TrackedRun
+from sejax.runs import trackers
+from sejax.runs.trackers import FinishedGeneration, GuardedTracker, TrackedRun
 
 
 class Listener:

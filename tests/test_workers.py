@@ -15,11 +15,11 @@ from support import ROOM, bits, printed, refusal, refused
 
 import sejax
 from sejax.bilevel import make_bilevel
-from sejax.cli import cluster, runtime, session, workers
-from sejax.cli import config as configuration
-from sejax.cli.cluster import Pool
-from sejax.cli.workers import Batch, RemoteChunks, cut
 from sejax.options import FailedError
+from sejax.runs import cluster, runtime, session, workers
+from sejax.runs import config as configuration
+from sejax.runs.cluster import Pool
+from sejax.runs.workers import Batch, RemoteChunks, cut
 
 FOREVER = 1e9
 
@@ -219,7 +219,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_so_they_do_with_the_flags_of_a_command(case):
     program = (
-        "from sejax.cli import runtime; runtime.configure_xla(1)\n"
+        "from sejax.runs import runtime; runtime.configure_xla(1)\n"
         "import sys, test_workers\n"
         "test_workers.require_equal_numbers(sys.argv[1:], 3)"
     )

@@ -25,9 +25,9 @@ import pandas as pd
 import yaml
 
 import sejax
-from sejax.cli import config as configuration
 from sejax.options.plain import flatten
 from sejax.proxies import header, zoo
+from sejax.runs import config as configuration
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
 COSTS = ("generations", "agents", "train_steps", "real_steps", "cpu_s")

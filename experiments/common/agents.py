@@ -19,11 +19,11 @@ import sejax
 from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task
 from sejax.agents import NoExploration
-from sejax.cli.progress import Tally
 from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
 from sejax.options.plain import to_plain
+from sejax.runs.progress import Tally
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")

@@ -19,7 +19,6 @@ import pandas as pd
 
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
-from sejax.cli import commands, runtime
 from sejax.ops.files import write_bytes
 from sejax.options import (
     ConfigError,
@@ -33,6 +32,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import from_plain, parsed, to_plain
+from sejax.runs import commands, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`

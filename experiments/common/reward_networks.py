@@ -28,10 +28,10 @@ from experiments.common.experiment import count, setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
 from sejax import ICMConfig, options
-from sejax.cli import config as configuration
-from sejax.cli import run_directory
 from sejax.options import ConfigError, listed, one_of, registry
 from sejax.options.plain import flatten
+from sejax.runs import config as configuration
+from sejax.runs import run_directory
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (

@@ -17,11 +17,11 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, setting
-from sejax.cli import config as configuration
-from sejax.cli import run_directory, session
-from sejax.cli.progress import Tally
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
+from sejax.runs import config as configuration
+from sejax.runs import run_directory, session
+from sejax.runs.progress import Tally
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
 QUICK = (

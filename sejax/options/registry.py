@@ -13,8 +13,8 @@ group         entry points            `make(...)` gives
 `proxy`       `sejax.proxies`         `(task)` a `sejax.ProxyEnv`
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
-`tracker`     `sejax.trackers`        `(run)` a `sejax.cli.trackers.Tracker`
-`machines`    `sejax.machines`        `(config, say)`: see `sejax.cli.workers`
+`tracker`     `sejax.trackers`        `(run)` a `sejax.runs.trackers.Tracker`
+`machines`    `sejax.machines`        `(config, say)`: see `sejax.runs.workers`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -160,12 +160,12 @@ GROUPS = {
     ),
     "tracker": Group(
         "sejax.trackers",
-        "sejax.cli.trackers:Tracker",
+        "sejax.runs.trackers:Tracker",
         ("run",),
         {
-            "none": "sejax.cli.trackers:NoTracker",
-            "tensorboard": "sejax.cli.trackers:TensorBoardConfig",
-            "wandb": "sejax.cli.trackers:WandbConfig",
+            "none": "sejax.runs.trackers:NoTracker",
+            "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
+            "wandb": "sejax.runs.trackers:WandbConfig",
         },
     ),
     "machines": Group(
@@ -173,8 +173,8 @@ GROUPS = {
         "contextlib:AbstractContextManager",
         ("config", "say"),
         {
-            "local": "sejax.cli.workers:LocalConfig",
-            "ray": "sejax.cli.workers:RayConfig",
+            "local": "sejax.runs.workers:LocalConfig",
+            "ray": "sejax.runs.workers:RayConfig",
         },
     ),
 }

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from sejax import envs
-from sejax.cli import config as configuration
-from sejax.cli.config import LearnConfig
 from sejax.distillation.policy_copy import CopyConfig
 from sejax.distillation.policy_search import SearchConfig
 from sejax.ops.files import as_file_name
 from sejax.options import Options, counts, one_of, option, positive, require
 from sejax.options.plain import from_plain, merge
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 
 # Students of a task's kind of actions where none are named, and how long they train.
 STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}

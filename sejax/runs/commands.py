@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from sejax.cli import compose, runtime
 from sejax.options import (
     ConfigError,
     FailedError,
@@ -22,6 +21,7 @@ from sejax.options import (
     shortened,
     told,
 )
+from sejax.runs import compose, runtime
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"

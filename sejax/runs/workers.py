@@ -18,18 +18,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sejax.cli import runtime
-from sejax.cli.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 from sejax.options import Options, counts, fraction, option, require
+from sejax.runs import runtime
+from sejax.runs.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
     from jax import Array
 
     from sejax.bilevel import Bilevel, LearnState
-    from sejax.cli.config import LearnConfig
-    from sejax.cli.session import Chunks
     from sejax.evaluation import Candidates, Evaluator
     from sejax.objectives import GenerationInfo, Outcome
+    from sejax.runs.config import LearnConfig
+    from sejax.runs.session import Chunks
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -45,7 +45,7 @@ class LocalConfig(Options):
         self, config: "LearnConfig", say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["Chunks"]:
         """The compiled generations of a run."""
-        from sejax.cli import session  # which imports jax
+        from sejax.runs import session  # which imports jax
 
         return contextlib.nullcontext(session.make_chunks(config))
 
@@ -80,7 +80,7 @@ class RayConfig(Options):
 def _remote_chunks(
     machines: RayConfig, config: "LearnConfig", say: Callable[[str], None]
 ) -> Iterator["RemoteChunks"]:
-    from sejax.cli import config as configuration
+    from sejax.runs import config as configuration
 
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
     from sejax.bilevel import make_bilevel
@@ -172,7 +172,7 @@ class Share:
 
 
 class RemoteChunks:
-    """In the place of `sejax.cli.session.Chunks`: the trainings are sent to workers.
+    """In the place of `sejax.runs.session.Chunks`: the trainings are sent to workers.
 
     `ask` and `tell` stay here. The state after a generation equals that of `Bilevel.generation` to
     the last bit, if the workers' CPUs are of this one's kind.
@@ -310,7 +310,7 @@ class Worker:
         )
         runtime.configure_jax()
         from sejax.bilevel import make_bilevel
-        from sejax.cli import config as configuration
+        from sejax.runs import config as configuration
 
         of_run = configuration.learn_config(config)
         learner = make_bilevel(**of_run.parts() | {"devices": 1})

@@ -14,14 +14,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sejax.cli import next_steps, preset_files
-from sejax.cli.config import LearnConfig, members_of
-from sejax.cli.trackers import FinishedGeneration, Reporter
 from sejax.options import registry
+from sejax.runs import next_steps, preset_files
+from sejax.runs.config import LearnConfig, members_of
+from sejax.runs.trackers import FinishedGeneration, Reporter
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
     from sejax.bilevel import Bilevel
-    from sejax.cli.run_directory import RunDirectory
+    from sejax.runs.run_directory import RunDirectory
 
 
 class Tally:

@@ -18,11 +18,11 @@ from jaxtyping import PyTree
 
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import Bilevel, make_bilevel
-from sejax.cli import config as configuration
-from sejax.cli.config import LearnConfig, members_of
-from sejax.cli.session import Chunks
 from sejax.options import Options, marks, traced_options
 from sejax.options.plain import to_plain
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig, members_of
+from sejax.runs.session import Chunks
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
 _FREE = (

@@ -14,11 +14,8 @@ import yaml
 from jaxtyping import Array
 
 from sejax.agents import make_agent
-from sejax.cli import config as configuration
-from sejax.cli import policies
-from sejax.cli.config import LearnConfig, members_of
-from sejax.cli.distill_config import DistillConfig
-from sejax.distillation import teaching
+from sejax.distillation import policies, teaching
+from sejax.distillation.config import DistillConfig
 from sejax.distillation.policy_copy import copy_policy, visit
 from sejax.distillation.policy_search import Policy, SearchConfig, make_search
 from sejax.distillation.teaching import Lesson
@@ -28,6 +25,8 @@ from sejax.options import ConfigError, require
 from sejax.options.plain import differences, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.io import fingerprint, save
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig, members_of
 
 ASKED = "distill.yaml"
 CHECKPOINT, KIND = "search.safetensors", "sejax_search"

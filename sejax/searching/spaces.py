@@ -23,13 +23,13 @@ import yaml
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import Trial
 
-from sejax.cli import compose
-from sejax.cli import config as configuration
 from sejax.options import ConfigError, nearest, require, shortened, told
 from sejax.options.plain import split
+from sejax.runs import compose
+from sejax.runs import config as configuration
 
 Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
-FOLDER = Path(__file__).parent / "spaces"
+FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a number: the override says exactly what was tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
 _CALL = re.compile(r"(choice|range|interval|int|tag)\((.*)\)", re.DOTALL)

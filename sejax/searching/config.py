@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from sejax.cli import compose, spaces
-from sejax.cli import config as configuration
-from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -28,9 +25,13 @@ from sejax.options import (
 )
 from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
 from sejax.proxies import hub
+from sejax.runs import compose
+from sejax.runs import config as configuration
+from sejax.runs.config import EvaluateConfig, LearnConfig
+from sejax.searching import spaces
 
 if TYPE_CHECKING:  # which nobody needs who searches on one machine
-    from sejax.cli.workers import LocalConfig, RayConfig
+    from sejax.runs.workers import LocalConfig, RayConfig
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")

@@ -17,7 +17,7 @@ import yaml
 from sejax.options import ConfigError, listed, require, shortened, told, unknown_name
 from sejax.options.plain import flatten, merge, parsed
 
-PRESETS = Path(__file__).parent / "presets"
+PRESETS = Path(__file__).parents[1] / "presets"
 GENERAL = "general"  # the presets of tasks without a file of their own
 ENDING = ".yaml"  # of a preset file
 

@@ -13,12 +13,12 @@ from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.table import Table
 
-from sejax.cli.preset_files import file_text
-from sejax.cli.search_config import Search
-from sejax.cli.study import ENDED
-from sejax.cli.trials import Runner
 from sejax.ops.files import write_text
 from sejax.options import as_text, registry
+from sejax.runs.preset_files import file_text
+from sejax.searching.config import Search
+from sejax.searching.study import ENDED
+from sejax.searching.trials import Runner
 
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from sejax.options import ConfigError, FailedError, shortened, told
 
 if TYPE_CHECKING:
-    from sejax.cli.workers import RayConfig
+    from sejax.runs.workers import RayConfig
 
 RESTARTS = 20  # by Ray, of a worker that dies
 RETRIES = -1  # by Ray, of a share; any number, as many fail at once until Ray knows a node is gone

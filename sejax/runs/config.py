@@ -1,8 +1,8 @@
 """A command's configuration: from the overrides that a user types to typed, validated dataclasses.
 
-An override is `group=choice`, `group.field=value` or `field=value`. `sejax.cli.compose` merges them
-with a preset into nested plain values; `sejax.options.registry` makes dataclasses of those, each
-value read by its field's type; the dataclasses check themselves.
+An override is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` merges
+them with a preset into nested plain values; `sejax.options.registry` makes dataclasses of those,
+each value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
@@ -14,7 +14,6 @@ from typing import Any, ClassVar, TypeVar
 from sejax import agents, envs
 from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
-from sejax.cli.compose import DEFAULTS, compose, key_of, mixture_of, named, read
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -31,6 +30,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import flatten, from_plain, to_plain
+from sejax.runs.compose import DEFAULTS, compose, key_of, mixture_of, named, read
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")

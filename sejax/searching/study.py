@@ -20,10 +20,10 @@ from optuna.exceptions import ExperimentalWarning, TrialPruned, UpdateFinishedTr
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from sejax.cli.search_config import REDUCTION_FACTOR, SQLITE, Search
-from sejax.cli.trials import Progress, Runner, worth
 from sejax.ops.files import require_writable
 from sejax.options import ConfigError, shortened, told
+from sejax.searching.config import REDUCTION_FACTOR, SQLITE, Search
+from sejax.searching.trials import Progress, Runner, worth
 
 STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial whose worker was lost

@@ -56,7 +56,7 @@ class FinishedGeneration:
 
 
 class Reporter:
-    """Hears how a run goes on; this one tells nobody. See `sejax.cli.progress`."""
+    """Hears how a run goes on; this one tells nobody. See `sejax.runs.progress`."""
 
     def status(self, text: str) -> None:
         """Hears what is being done now."""

@@ -20,13 +20,6 @@ import numpy as np
 from jax import Array
 
 from sejax.agents import make_agent
-from sejax.cli import config as configuration
-from sejax.cli import session
-from sejax.cli.config import EvaluateConfig, LearnConfig
-from sejax.cli.programs import Programs, kept, static_of, structure_of
-from sejax.cli.run_directory import open_for
-from sejax.cli.search_config import DEFAULT, Search
-from sejax.cli.worlds import proxy_setup
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
 from sejax.ops.files import write_text
@@ -34,6 +27,13 @@ from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import require, shortened
 from sejax.options.plain import flatten, to_plain
 from sejax.proxies import header
+from sejax.runs import config as configuration
+from sejax.runs import session
+from sejax.runs.config import EvaluateConfig, LearnConfig
+from sejax.runs.programs import Programs, kept, static_of, structure_of
+from sejax.runs.run_directory import open_for
+from sejax.runs.worlds import proxy_setup
+from sejax.searching.config import DEFAULT, Search
 
 Config = TypeVar("Config", LearnConfig, EvaluateConfig)
 T = TypeVar("T", list[dict[str, Any]], dict[str, float])

@@ -9,13 +9,14 @@ from typing import Any
 
 import optuna
 
-from sejax.cli import cluster, runtime, search_config
-from sejax.cli.search_config import Search
-from sejax.cli.study import ENDED, open_study, sentence
-from sejax.cli.study import work as take_trials
-from sejax.cli.trials import runner_of
-from sejax.cli.workers import RayConfig
 from sejax.options import FailedError, registry
+from sejax.runs import cluster, runtime
+from sejax.runs.workers import RayConfig
+from sejax.searching import config as search_config
+from sejax.searching.config import Search
+from sejax.searching.study import ENDED, open_study, sentence
+from sejax.searching.study import work as take_trials
+from sejax.searching.trials import runner_of
 
 RETRIES = 5  # of a worker that is lost
 LAST_S = 60.0  # for workers to notice that the study is over

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple, TypeVar
 
 from sejax import agents, envs
 from sejax.agents.base import AgentConfig
-from sejax.cli import config as configuration
-from sejax.cli.compose import named
-from sejax.cli.config import EvaluateConfig, MixtureMember, members_of
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, ProxySet, load_proxy
+from sejax.runs import config as configuration
+from sejax.runs.compose import named
+from sejax.runs.config import EvaluateConfig, MixtureMember, members_of
 from sejax.training import TrainingConfig, require_reachable, training_of
 
 Loaded = TypeVar("Loaded", Proxy, ProxySet)

@@ -1,4 +1,4 @@
-"""The commands' parts: configuration, run directories, progress, trackers, plots, search.
+"""The commands' parts: configuration, run directories, progress, trackers, plots.
 
 Nothing below imports it. A run goes `config` (overrides to a configuration) -> `session` (the
 driver of a run) -> `run_directory` (its one checkpoint).

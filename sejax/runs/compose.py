@@ -1,4 +1,4 @@
-"""From the overrides that a user types to nested plain values: the first half of `cli.config`.
+"""From the overrides that a user types to nested plain values: the first half of `runs.config`.
 
 An override is `group=choice`, `group.field=value` or `field=value`. `read` splits them into names
 and texts, and puts the values of a preset file beneath them. `compose` finds the choice of every
@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 from sejax import agents
 from sejax.agents.mixture import MixtureConfig
-from sejax.cli import preset_files
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -41,10 +40,11 @@ from sejax.options.plain import (
     unknown_field,
     unquoted,
 )
+from sejax.runs import preset_files
 from sejax.training import TrainingConfig
 
 if TYPE_CHECKING:
-    from sejax.cli.config import CommandConfig
+    from sejax.runs.config import CommandConfig
 
 # Choices where neither an override nor the task or the proxy makes one.
 DEFAULTS = {

@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import numpy as np
 import yaml
 
-from sejax.cli import runtime
 from sejax.ops import checksummed
 from sejax.ops.files import FolderLock, remove_leftovers, write_bytes, write_text
 from sejax.options import ConfigError
 from sejax.options.plain import differences
+from sejax.runs import runtime
 
 if TYPE_CHECKING:  # which import jax
     from jax import Array
     from jax.tree_util import KeyPath
     from jaxtyping import PyTree
 
-    from sejax.cli.config import LearnConfig
     from sejax.objectives import GenerationInfo
+    from sejax.runs.config import LearnConfig
 
 COLUMNS = (
     "generation",
@@ -319,7 +319,7 @@ def open_for(config: "LearnConfig", hint: str = HINT) -> RunDirectory:
     Raises:
       ConfigError: as of `RunDirectory`.
     """
-    from sejax.cli import config as configuration  # which imports jax
+    from sejax.runs import config as configuration  # which imports jax
 
     return RunDirectory(
         config.resolved_run_dir,
