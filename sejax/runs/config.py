@@ -127,14 +127,22 @@ class CommandConfig(Options):
     groups: ClassVar[tuple[str, ...]] = ()
     learns: ClassVar[bool] = False
 
-    agent: Any = None  # trains on the proxies; null with `agents`
-    agents: AgentsConfig | None = None  # several agents in place of one: agents=[ddqn,ppo]
-    exploration: ExplorationConfig  # intrinsic reward of the agents
-    training: TrainingConfig = TRAINING  # on proxies
+    agent: Any = option(None, help="trains on the proxies; null with `agents`")
+    agents: AgentsConfig | None = option(
+        None, help="several agents in place of one: agents=[ddqn,ppo]"
+    )
+    exploration: ExplorationConfig = option(help="intrinsic reward of the agents")
+    training: TrainingConfig = option(TRAINING, help="on proxies")
     seed: int = option(0, seed())
-    # Agents that train side by side on one device; null: what suits the agent and the device.
-    num_parallel: int | None = option(None, counts("something must compute"))
-    devices: int | None = option(None, counts("something must compute"))  # null: all
+    num_parallel: int | None = option(
+        None,
+        counts("something must compute"),
+        help=(
+            "Agents that train side by side on one device; null: what suits the agent and the "
+            "device."
+        ),
+    )
+    devices: int | None = option(None, counts("something must compute"), help="null: all")
 
     @staticmethod
     def spec_for(given: Mapping[str, Any]) -> TaskSpec:
@@ -159,25 +167,40 @@ class LearnConfig(CommandConfig):
         *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
     )
 
-    preset: str = "best"  # settings that were measured (best) or published (paper)
-    env: Any  # the real task
-    proxy: Any  # what is learned: a synthetic environment (se) or a reward network (rn)
-    es: Any  # the evolution strategy of the outer loop
-    objective: Any  # what the outer loop maximises
-    tracker: Any  # follows the run beside its files
-    machines: Any  # where agents train
-    # default: the agent's; varied: learning rate, batch and network drawn anew for each training.
-    agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
-    # n_o: steps of the outer loop.
-    generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
-    # Independent runs, with seeds seed, seed + 1, ...
-    num_seeds: int = option(1, counts("it counts runs"))
-    # End a run at its first incumbent mean that reaches the solved threshold.
-    stop_when_solved: bool = False
+    preset: str = option("best", help="settings that were measured (best) or published (paper)")
+    env: Any = option(help="the real task")
+    proxy: Any = option(
+        help="what is learned: a synthetic environment (se) or a reward network (rn)"
+    )
+    es: Any = option(help="the evolution strategy of the outer loop")
+    objective: Any = option(help="what the outer loop maximises")
+    tracker: Any = option(help="follows the run beside its files")
+    machines: Any = option(help="where agents train")
+    agent_hparams: str = option(
+        "default",
+        one_of(AGENT_HPARAMS),
+        help=(
+            "default: the agent's; varied: learning rate, batch and network drawn anew for each "
+            "training."
+        ),
+    )
+    generations: int = option(
+        100,
+        counts("there is nothing to do otherwise", most=1_000_000),
+        help="n_o: steps of the outer loop.",
+    )
+    num_seeds: int = option(
+        1, counts("it counts runs"), help="Independent runs, with seeds seed, seed + 1, ..."
+    )
+    stop_when_solved: bool = option(
+        False, help="End a run at its first incumbent mean that reaches the solved threshold."
+    )
     checkpoint_every: int = option(
-        1, counts("it counts generations")
-    )  # generations between checkpoints
-    run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
+        1, counts("it counts generations"), help="generations between checkpoints"
+    )
+    run_dir: str | None = option(
+        None, help="null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -270,21 +293,39 @@ class EvaluateConfig(CommandConfig):
 
     groups: ClassVar[tuple[str, ...]] = ("agent", "exploration")
 
-    proxy: str  # a run directory, a safetensors file, a shipped name (cartpole), or real
-    env: str | None = None  # the task, where proxy=real or the proxy's is your own
-    proxy_kind: str | None = None  # my_module:MyProxy, where the proxy is of a kind of your own
-    # as_learned: agents and exploration that the proxy was learned with, where no agent is named;
-    # default: the agent's; varied: drawn around them for each agent.
-    agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
-    # How long agents train on the proxy. proxy: on an SE as it was learned with, on a reward
-    # network as on the real task (as_learned: with the time limit as in its run); config: as
-    # `training` says.
-    training_from: str = option("proxy", one_of(TRAINING_FROM))
+    proxy: str = option(
+        help="a run directory, a safetensors file, a shipped name (cartpole), or real"
+    )
+    env: str | None = option(None, help="the task, where proxy=real or the proxy's is your own")
+    proxy_kind: str | None = option(
+        None, help="my_module:MyProxy, where the proxy is of a kind of your own"
+    )
+    agent_hparams: str = option(
+        "default",
+        one_of(EVALUATION_HPARAMS),
+        help=(
+            "as_learned: agents and exploration that the proxy was learned with, where no agent "
+            "is named; default: the agent's; varied: drawn around them for each agent."
+        ),
+    )
+    training_from: str = option(
+        "proxy",
+        one_of(TRAINING_FROM),
+        help=(
+            "How long agents train on the proxy. proxy: on an SE as it was learned with, on a "
+            "reward network as on the real task (as_learned: with the time limit as in its run); "
+            "config: as `training` says."
+        ),
+    )
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
-    baseline: bool = True  # as many agents trained on the real task, beside them
-    out_dir: str | None = None  # null: beside the proxy (runs/evaluate-<name> without a folder)
-    # On the real task, and how all agents are tested unless training_from=config.
-    real_training: TrainingConfig = REAL_TRAINING
+    baseline: bool = option(True, help="as many agents trained on the real task, beside them")
+    out_dir: str | None = option(
+        None, help="null: beside the proxy (runs/evaluate-<name> without a folder)"
+    )
+    real_training: TrainingConfig = option(
+        REAL_TRAINING,
+        help="On the real task, and how all agents are tested unless training_from=config.",
+    )
 
     @staticmethod
     def spec_for(given: Mapping[str, Any]) -> TaskSpec:

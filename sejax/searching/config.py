@@ -64,35 +64,61 @@ class SearchConfig(Options):
 
     group: ClassVar[str] = ""
 
-    # trials that end, pruned or complete
-    trials: int = option(60, counts("there is nothing to compare otherwise"))
-    sampler: str = option("tpe", one_of(SAMPLERS))  # tpe or random
-    # null: drawn, so that workers do not draw alike
-    sampler_seed: int | None = option(None, counts("it seeds a generator", least=0))
-    pruner: str = option("hyperband", one_of(PRUNERS))  # hyperband, median or none
-    # before a trial may be pruned
-    min_generations: int = option(3, counts("a trial must show something"))
-    # of a trial that is not pruned
-    max_generations: int = option(27, counts("there is nothing to do otherwise"))
-    seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial
-    score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds: mean or worst
-    # The score of a seed. last: of its last generation; best: its best so far; mean: the mean of
-    # all so far, which rewards learning early. null: last for a proxy, mean for an agent
-    measure: str | None = option(None, one_of(MEASURES))
-    space: str | None = None  # a preset of ranges, or FILE.yaml
-    study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
-    storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
-    search_dir: str | None = None  # null: runs/search-<study>
-    # s, after which no trial is begun
-    timeout: float | None = option(None, positive("no trial would start"))
+    trials: int = option(
+        60,
+        counts("there is nothing to compare otherwise"),
+        help="trials that end, pruned or complete",
+    )
+    sampler: str = option("tpe", one_of(SAMPLERS), help="tpe or random")
+    sampler_seed: int | None = option(
+        None,
+        counts("it seeds a generator", least=0),
+        help="null: drawn, so that workers do not draw alike",
+    )
+    pruner: str = option("hyperband", one_of(PRUNERS), help="hyperband, median or none")
+    min_generations: int = option(
+        3, counts("a trial must show something"), help="before a trial may be pruned"
+    )
+    max_generations: int = option(
+        27, counts("there is nothing to do otherwise"), help="of a trial that is not pruned"
+    )
+    seeds: int = option(1, counts("a trial needs a run"), help="runs of a trial")
+    score: str = option("mean", one_of(SCORES), help="of a trial, over its seeds: mean or worst")
+    measure: str | None = option(
+        None,
+        one_of(MEASURES),
+        help=(
+            "The score of a seed. last: of its last generation; best: its best so far; mean: the "
+            "mean of all so far, which rewards learning early. null: last for a proxy, mean for "
+            "an agent"
+        ),
+    )
+    space: str | None = option(None, help="a preset of ranges, or FILE.yaml")
+    study: str | None = option(None, help="null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>")
+    storage: str | None = option(None, help="null: SQLite in search_dir; any URL that Optuna takes")
+    search_dir: str | None = option(None, help="null: runs/search-<study>")
+    timeout: float | None = option(
+        None, positive("no trial would start"), help="s, after which no trial is begun"
+    )
     heartbeat: int = option(
-        15, counts("workers must show that they live")
-    )  # seconds between signs of life of a worker
-    # The best trials that are tried again, as the best score of many is the luckiest too: on the
-    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5)
-    verify: int | None = option(None, counts("the best are tried again", least=0))
-    # new seeds of each that is tried again
-    fresh_seeds: int = option(5, counts("the best are tried again with them"))
+        15,
+        counts("workers must show that they live"),
+        help="seconds between signs of life of a worker",
+    )
+    verify: int | None = option(
+        None,
+        counts("the best are tried again", least=0),
+        help=(
+            "The best trials that are tried again, as the best score of many is the luckiest too:"
+            " on the real task after a search on a proxy (null: 10), else with seeds that are new"
+            " (null: 5)"
+        ),
+    )
+    fresh_seeds: int = option(
+        5,
+        counts("the best are tried again with them"),
+        help="new seeds of each that is tried again",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
