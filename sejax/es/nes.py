@@ -55,6 +55,7 @@ class NESConfig(StrategyOptions):
     score_transform: str | OwnTransform = option(
         "all_better_2",
         require_transform,
+        names_code=True,
         help="A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.",
     )
     update_rule: str = option(

@@ -21,6 +21,7 @@ import dataclasses
 import difflib
 import numbers
 import os
+import re
 import sysconfig
 import textwrap
 import traceback
@@ -53,6 +54,13 @@ class ConfigError(ValueError):
     def __init__(self, message: str, field: str = ""):
         super().__init__(message)
         self.field = field
+
+    def moved(self, group: str, where: str) -> "ConfigError":
+        """The same error of fields that stand elsewhere, as `agents.ddqn` for `agent`."""
+        if group in ("", where):
+            return self
+        at_fault = re.sub(rf"^{group}\b", where, self.field)
+        return ConfigError(re.sub(rf"\b{group}(?=\.\w| must )", where, str(self)), at_fault)
 
 
 class FailedError(RuntimeError):
@@ -144,6 +152,7 @@ def option(
     help: str = "",
     traced: bool = False,
     varied: str | None = None,
+    names_code: bool = False,
 ) -> Any:
     """A dataclass field.
 
@@ -154,8 +163,9 @@ def option(
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
+      names_code: whether its text may be a `module:attribute`, which no file may name.
     """
-    metadata = {"rule": rule, "traced": traced, "varied": varied}
+    metadata = {"rule": rule, "traced": traced, "varied": varied, "names_code": names_code}
     metadata |= {"help": help} if help else {}  # else that of the class which a subclass overrides
     return dataclasses.field(default=default, metadata=metadata)
 

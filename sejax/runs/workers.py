@@ -321,7 +321,7 @@ class Worker:
         from sejax.bilevel import make_bilevel
         from sejax.runs import config as configuration
 
-        of_run = configuration.learn_config(config)
+        of_run = configuration.learn_config(config, imports=None)
         learner = make_bilevel(**of_run.parts() | {"devices": 1})
         self._capacities = capacities
         self._programs = [

@@ -183,7 +183,7 @@ class Search:
         choices = [x for x in self.fixed if "." not in x.partition("=")[0]]
         if self.is_of_agent and not given:
             config = configuration.evaluate_config([*choices, DEFAULT])
-            return registry.name_of("agent", config.agent)
+            return config.name("agent")
         return given or configuration.config(choices).name("agent")
 
     @functools.cached_property
@@ -281,6 +281,7 @@ def read(overrides: Sequence[str]) -> Search:
             space[name] = spaces.parse(name, text)
         else:
             fixed.append(f"{name}={text}")
+    _require_typed("preset", fixed, overrides)
     config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
@@ -296,14 +297,20 @@ def read(overrides: Sequence[str]) -> Search:
     given = {override.partition("=")[0] for override in fixed} | set(space)
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     offered = {name: x for name, x in preset.items() if name not in given}
-    foreign = registry.untyped(x.text for x in offered.values())
+    _require_typed("space", [x.text for x in offered.values()], overrides)
+    return dataclasses.replace(search, space={**offered, **space})
+
+
+def _require_typed(field: str, texts: Sequence[str], overrides: Sequence[str]) -> None:
+    """Checks that a file names no module that the user has not typed."""
+    typed = registry.paths_in(overrides)
+    foreign = [path for path in registry.paths_in(texts) if path not in typed]
     require(
         not foreign,
-        "space",
-        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Set "
-        "agent='choice(...)' on the command line.",
+        field,
+        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Type "
+        "it on the command line too.",
     )
-    return dataclasses.replace(search, space={**offered, **space})
 
 
 def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict[str, object]:
