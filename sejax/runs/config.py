@@ -84,8 +84,8 @@ class CommandConfig(Options):
     devices: int | None = option(None, counts("something must compute"), help="null: all")
 
     @property
-    def agent(self) -> AgentConfig:
-        """The agent, where it is one alone."""
+    def agent(self) -> Any:
+        """The agent's configuration, where it is one alone."""
         (agent,) = self.agents.values()
         return agent
 

@@ -183,7 +183,7 @@ class Search:
         choices = [x for x in self.fixed if "." not in x.partition("=")[0]]
         if self.is_of_agent and not given:
             config = configuration.evaluate_config([*choices, DEFAULT])
-            return config.name("agent")
+            return configuration.JOINT.join(config.agents)
         return given or configuration.config(choices).name("agent")
 
     @functools.cached_property

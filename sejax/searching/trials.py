@@ -295,7 +295,7 @@ class Tuning:
         key = json.dumps(
             [
                 world,
-                static_of(member.agent),
+                static_of(agent_config),
                 static_of(setup.exploration),
                 to_plain(training),
                 structure_of(agent.hparams),
