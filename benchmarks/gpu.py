@@ -36,7 +36,6 @@ import numpy as np
 import sejax
 from sejax.bilevel import make_bilevel
 from sejax.runs import config as configuration
-from sejax.runs.config import members_of
 from sejax.runs.runtime import configure_jax
 from sejax.training import TrainingConfig, make_trainer
 
@@ -269,8 +268,7 @@ def training_of(name: str, num: int, steps: int) -> tuple[Callable[..., Any], An
     world = AGENTS[name]
     run = configuration.config(world.words)
     env, params = sejax.load(world.proxy) if world.proxy else fresh_se(run)
-    (member,) = members_of(run)
-    config = dataclasses.replace(member.agent, **early(member.agent))
+    config = dataclasses.replace(run.agent, **early(run.agent))
     agent = sejax.make_agent(config, env.task)
     training = TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
     return make_trainer(agent, env, training), jax.random.split(jax.random.key(0), num), params

@@ -42,7 +42,7 @@ from experiments.common.tables import as_texts, publish, summary_by
 from sejax import ProxySet, Task
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.evaluation import make_recorder, make_tested_trainer
-from sejax.options import each_of, registry
+from sejax.options import each_of
 from sejax.training import TrainingConfig
 
 NUM_BINS, NUM_DRAWN = 2000, 80  # of the rows, and of the figure
@@ -100,7 +100,7 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
             name=kind,
             agent=agent,
             training=groups.training_as_learned(ses, agent, settings.test_episodes, most),
-            exploration=registry.configure("exploration", ses.config["exploration"]),
+            exploration=ses.learned_with("exploration"),
             settings=settings.values("max_rows"),
             is_single=True,
         )

@@ -13,7 +13,7 @@ from sejax.agents import make_agent
 from sejax.ops.files import require_writable, write_text
 from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
-from sejax.runs.config import EvaluateConfig, MixtureMember
+from sejax.runs.config import EvaluateConfig
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
 
 if TYPE_CHECKING:  # which takes 0.3 s to import
@@ -45,8 +45,8 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    words = configuration.with_learned(overrides)
-    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, words)}"
+    composed = configuration.composed_evaluation(overrides)
+    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, composed)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:
@@ -86,25 +86,23 @@ def evaluate(config: EvaluateConfig) -> float:
     out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
-        (world, member.key): _train_and_test(config, setup, world, member)
+        (world, key): _train_and_test(config, setup, world, key)
         for world in setup.worlds
-        for member in setup.members
+        for key in setup.agents
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
     summary = summarise(table, ["world", "agent"] if setup.has_several else ["world"])
     _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    title = f"fresh {' + '.join(each.key for each in setup.members)} agents on {setup.task.name}"
+    title = f"fresh {' + '.join(setup.agents)} agents on {setup.task.name}"
     plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png", title)
     first = table[table["world"] == next(iter(setup.worlds))]
     return float(first["test_return"].mean())
 
 
-def _train_and_test(
-    config: EvaluateConfig, setup: Setup, world: str, member: MixtureMember
-) -> "pd.DataFrame":
-    """A row for each agent of a member."""
+def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> "pd.DataFrame":
+    """A row for each agent of a kind."""
     import jax
     import pandas as pd
 
@@ -113,9 +111,9 @@ def _train_and_test(
 
     env, env_params, trainings = setup.worlds[world]
     varied = config.agent_hparams == "varied"
-    agent = make_agent(member.agent, setup.task, setup.exploration, varied)
+    agent = make_agent(setup.agents[key], setup.task, setup.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    who = f"{member.key} agents" if setup.has_several else "agents"
+    who = f"{key} agents" if setup.has_several else "agents"
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
         outcome = jax.device_get(
@@ -124,7 +122,7 @@ def _train_and_test(
                 env,
                 env_params,
                 setup.task,
-                trainings[member.key],
+                trainings[key],
                 keys,
                 config.num_parallel,
                 config.devices,
@@ -135,7 +133,7 @@ def _train_and_test(
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if setup.has_several:
-        numbers = {"agent": member.key, "number": range(config.num_agents)}
+        numbers = {"agent": key, "number": range(config.num_agents)}
     of_agents = {  # not of episodes, and no agreement of ranks
         name: x for name, x in vars(outcome).items() if x is not None and x.ndim == 1
     }
@@ -173,7 +171,7 @@ def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) 
     from rich.table import Table
 
     task = setup.task
-    who = "agents of each kind" if setup.has_several else f"{setup.members[0].key} agents"
+    who = "agents of each kind" if setup.has_several else f"{next(iter(setup.agents))} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

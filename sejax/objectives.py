@@ -97,10 +97,19 @@ class MaxReward(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = True
 
-    # Steps of a test episode that are scored in the first generation; null: the task's limit.
-    first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
-    # Generation from which on the task's limit counts; before, the steps change linearly.
-    curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
+    first_eval_steps: int | None = option(
+        None,
+        counts("there is nothing to score otherwise"),
+        help=(
+            "Steps of a test episode that are scored in the first generation; null: the task's "
+            "limit."
+        ),
+    )
+    curriculum_generations: int = option(
+        50,
+        counts("it is the length of a curriculum"),
+        help="Generation from which on the task's limit counts; before, the steps change linearly.",
+    )
 
     def make(self, task: Task) -> Objective:
         """The objective on a task."""
@@ -135,8 +144,11 @@ class RewardThreshold(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    # w_sol: training steps that a unit of missing return is worth
-    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
+    unsolved_weight: float = option(
+        100.0,
+        not_negative("a shortfall must not be rewarded"),
+        help="w_sol: training steps that a unit of missing return is worth",
+    )
 
     def make(self, task: Task) -> Objective:
         """The objective on a task.

@@ -42,7 +42,8 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{compose.help_text(LearnConfig, overrides)}"
+    composed = configuration.composed_run(overrides)
+    return f"{ABOUT}\n{compose.help_text(LearnConfig, composed)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:

@@ -61,24 +61,49 @@ class TrainingConfig(Options):
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(2000, counts("it counts episodes"))  # n_e: of a training at most
-    # The stop rule waits for so many training steps.
-    min_steps: int = option(0, counts("it counts steps", least=0))
-    # Training ends after so many steps, whatever the rule says.
-    max_steps: int | None = option(2000, counts("an agent must train"))
-    stop_rule: str = option("never", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
-    # d: episodes in each of the two means that the plateau rule compares
-    window: int = option(10, counts("it counts episodes"))
-    # C_diff: relative change between them that counts as flat
-    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
-    # Whose last d returns must reach the solved reward.
-    solved_by: str = option("test", one_of(SOLVED_BY))
-    # n_te: greedy episodes on the real task after training
-    test_episodes: int = option(10, counts("it counts episodes"))
-    # Greedy episodes on the real task after each training episode; the solved rule by tests has at
-    # least one.
-    tests_between: int = option(0, counts("it counts episodes", least=0))
-    time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
+    max_episodes: int = option(
+        2000, counts("it counts episodes"), help="n_e: of a training at most"
+    )
+    min_steps: int = option(
+        0,
+        counts("it counts steps", least=0),
+        help="The stop rule waits for so many training steps.",
+    )
+    max_steps: int | None = option(
+        2000,
+        counts("an agent must train"),
+        help="Training ends after so many steps, whatever the rule says.",
+    )
+    stop_rule: str = option("never", one_of(STOP_RULES), help="plateau (SEs), solved (real tasks)")
+    window: int = option(
+        10,
+        counts("it counts episodes"),
+        help="d: episodes in each of the two means that the plateau rule compares",
+    )
+    plateau_tolerance: float = option(
+        0.01,
+        not_negative("it bounds a relative change"),
+        help="C_diff: relative change between them that counts as flat",
+    )
+    solved_by: str = option(
+        "test", one_of(SOLVED_BY), help="Whose last d returns must reach the solved reward."
+    )
+    test_episodes: int = option(
+        10,
+        counts("it counts episodes"),
+        help="n_te: greedy episodes on the real task after training",
+    )
+    tests_between: int = option(
+        0,
+        counts("it counts episodes", least=0),
+        help=(
+            "Greedy episodes on the real task after each training episode; the solved rule by "
+            "tests has at least one."
+        ),
+    )
+    time_limit_is_terminal: bool = option(
+        True, help="a real episode cut by the limit does not bootstrap"
+    )
 
     @property
     def is_fixed_length(self) -> bool:

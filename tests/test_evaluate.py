@@ -24,7 +24,6 @@ from sejax.ops.files import require_writable
 from sejax.options import registry
 from sejax.runs import config as configuration
 from sejax.runs import plots, progress
-from sejax.runs.config import members_of
 from sejax.runs.worlds import proxy_setup
 from sejax.training import budget_for
 
@@ -56,7 +55,7 @@ def learned(*words):
 
 def save(path, *words):
     config, env, weights = learned(*words)
-    discount = members_of(config)[0].agent.discount
+    discount = next(iter(config.agents.values())).discount
     sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
     return path
 
@@ -192,7 +191,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
-    assert as_learned.members == members_of(learned(*words)[0])
+    assert as_learned.agents == learned(*words)[0].agents
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
@@ -263,7 +262,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
                  "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
     setup = proxy_setup(composed)
-    assert setup.members[0].agent == config.agent and setup.exploration == config.exploration
+    assert setup.agents == config.agents and setup.exploration == config.exploration
     # Its dynamics are real.
     assert setup.worlds["the proxy"][2] == {"q_learning": composed.real_training}
     evaluate(composed)

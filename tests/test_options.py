@@ -162,7 +162,10 @@ def test_errors_name_the_field_and_survive_pickling():  # workers on other machi
     assert error.field == pickle.loads(pickle.dumps(error)).field == "agent.batch_size"
 
 
-def test_the_comments_of_fields_are_their_help_texts():
-    texts = options.help_texts(DDQNConfig)
-    assert texts["batch_size"] == "transitions"
-    assert set(texts) <= {field.name for field in dataclasses.fields(DDQNConfig)}
+def test_fields_have_help_texts_which_a_subclass_keeps():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Mine(DDQNConfig):
+        batch_size: int = 3
+
+    assert options.help_texts(Mine)["batch_size"] == "transitions"
+    assert set(options.help_texts(Mine)) <= {field.name for field in dataclasses.fields(Mine)}

@@ -83,13 +83,13 @@ def write_run(path, config):
 FOREIGN = [
     {"env": SHELL},
     {"env": {"name": IMPORTED}},
-    {"agent": {"name": IMPORTED}},
+    {"agents": None, "agent": {"name": IMPORTED}},
     {"proxy": {"name": IMPORTED}},
     {"es": {"name": IMPORTED}},
     {"objective": {"name": IMPORTED}},
     {"es": {"name": "nes", "score_transform": IMPORTED}},
     {"exploration": {"name": IMPORTED}},
-    {"agent": None, "agents": {"ddqn": {"name": IMPORTED, "weight": 1.0}}},
+    {"agents": {"ddqn": {"name": IMPORTED, "weight": 1.0}}},
 ]
 NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
 
@@ -149,7 +149,7 @@ def test_a_study_is_compared_as_text(folder, refused, stored):
     assert not (folder / "victim").exists()
 
 
-PROXIES = [x for x in FOREIGN if next(iter(x)) in ("env", "proxy", "agent")]
+PROXIES = [x for x in FOREIGN if {"env", "proxy", "agents"} & {*x}]
 
 
 def write_proxy(config):
@@ -165,7 +165,7 @@ def write_proxy(config):
 def test_a_proxys_file_names_no_module(folder, refused, foreign):
     write_proxy(foreign)
     refused(evaluate_command, "proxy=evil.safetensors", "agent_hparams=as_learned", "out_dir=out")
-    if "agent" not in foreign:  # of which nothing is read there
+    if "agents" not in foreign:  # of which nothing is read there
         refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 

@@ -72,7 +72,8 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
     curves = path.with_name("curves.csv.xz")
     if path.is_dir():
         ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
-        config = yaml.safe_load((path / "config.yaml").read_text())
+        stored = yaml.safe_load((path / "config.yaml").read_text())
+        config = configuration.plain(configuration.learn_config(stored))
         costs = {name: ended[name] for name in COSTS}
     elif curves.exists():
         learned = configuration.learn_config(proxy.config)  # with the names of today
@@ -91,9 +92,8 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
 
 def words_of(config: Mapping[str, Any]) -> list[str]:
     """The shortest overrides that compose a run's configuration, but for its place and devices."""
-    several = [key for key, each in (config["agents"] or {}).items() if isinstance(each, Mapping)]
-    names = ",".join(config["agents"][key]["name"] for key in several)
-    agents = f"agents=[{names}]" if several else f"agent={config['agent']['name']}"
+    names = [each["name"] for each in config["agents"].values() if isinstance(each, Mapping)]
+    agents = f"agents=[{','.join(names)}]" if len(names) > 1 else f"agent={names[0]}"
     groups = ("proxy", "exploration", "es", "objective")
     words = [f"env={config['env']['name']}", f"preset={config['preset']}", agents]
     words += [f"{group}={config[group]['name']}" for group in groups]

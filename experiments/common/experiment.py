@@ -27,11 +27,10 @@ from sejax.options import (
     as_text,
     counts,
     help_texts,
-    registry,
     require,
     shortened,
 )
-from sejax.options.plain import from_plain, parsed, to_plain
+from sejax.options.plain import from_plain, parsed
 from sejax.runs import commands, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
@@ -207,13 +206,11 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
-        fields = to_plain(settings).items()
-        with registry.only_typed(f"{name}={value}" for name, value in fields):
-            if not settings.from_rows:
-                write_rows(settings.rows_file, self.compute(settings))
-                made_with = json.dumps(settings.shards.made_with, indent=1)
-                write_bytes(settings.settings_file, lzma.compress(f"{made_with}\n".encode()))
-            return self.report(settings, read_rows(settings.rows_file))
+        if not settings.from_rows:
+            write_rows(settings.rows_file, self.compute(settings))
+            made_with = json.dumps(settings.shards.made_with, indent=1)
+            write_bytes(settings.settings_file, lzma.compress(f"{made_with}\n".encode()))
+        return self.report(settings, read_rows(settings.rows_file))
 
     def main(self) -> None:
         """The command; bad input ends it with one message."""

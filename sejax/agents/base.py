@@ -217,8 +217,11 @@ class AgentOptions(AgentConfig):
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    # Episodes before learning starts and before a stop rule may judge.
-    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(
+        1,
+        counts("it counts episodes", least=0),
+        help="Episodes before learning starts and before a stop rule may judge.",
+    )
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         return self.warmup_episodes * max_episode_steps
@@ -232,8 +235,8 @@ class AgentOptions(AgentConfig):
 class TorsoOptions(AgentOptions):
     """What agents share that can see images."""
 
-    torso: str | None = option(None, one_of(("conv",)))  # what comes before the hidden layers
-    num_filters: int = option(16, counts())  # of torso=conv, each of 3 x 3 pixels
+    torso: str | None = option(None, one_of(("conv",)), help="what comes before the hidden layers")
+    num_filters: int = option(16, counts(), help="of torso=conv, each of 3 x 3 pixels")
 
     def __post_init__(self) -> None:
         super().__post_init__()

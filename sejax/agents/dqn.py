@@ -33,17 +33,29 @@ LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 class DDQNConfig(OffPolicyOptions, TorsoOptions):
     """DDQN's hyperparameters."""
 
-    epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
+    epsilon_init: float = option(1.0, fraction(), traced=True, help="share of random actions")
     epsilon_min: float = option(0.01, fraction(), traced=True)
-    epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
-    # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
-    # the episodes: for environments whose episodes have one or two steps.
-    exploration_steps: int | None = option(1000, counts("it counts steps"), traced=True)
-    double: bool = True  # the online network chooses a target's action; else the target network
-    loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
-    target_update_every: int = option(1, counts())  # learning steps for each update of the target
-    train_every: int = option(1, counts())  # agent steps for each time that it learns, ...
-    gradient_steps: int = option(1, counts())  # ... in so many learning steps
+    epsilon_decay: float = option(0.9, fraction(), traced=True, help="factor for each episode")
+    exploration_steps: int | None = option(
+        1000,
+        counts("it counts steps"),
+        traced=True,
+        help=(
+            "If given, epsilon falls linearly in so many steps from when the agent first learns, "
+            "whatever the episodes: for environments whose episodes have one or two steps."
+        ),
+    )
+    double: bool = option(
+        True, help="the online network chooses a target's action; else the target network"
+    )
+    loss: str = option(
+        "squared", one_of(LOSSES), help="of the error; huber: its gradient is clipped"
+    )
+    target_update_every: int = option(
+        1, counts(), help="learning steps for each update of the target"
+    )
+    train_every: int = option(1, counts(), help="agent steps for each time that it learns, ...")
+    gradient_steps: int = option(1, counts(), help="... in so many learning steps")
 
     @property
     def learns_each_step(self) -> bool:
@@ -75,9 +87,12 @@ class DuelingDDQNConfig(DDQNConfig):
 
     cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
-    feature_dim: int = option(64, counts())  # outputs of the part that both streams share
-    # Hidden layers of the value and of the advantage stream.
-    stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
+    feature_dim: int = option(64, counts(), help="outputs of the part that both streams share")
+    stream_num_layers: int = option(
+        1,
+        counts("it counts layers", 0, MOST_LAYERS),
+        help="Hidden layers of the value and of the advantage stream.",
+    )
     stream_hidden_size: int = option(32, counts())
 
     def network(self, num_actions: int) -> nn.Module:

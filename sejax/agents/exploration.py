@@ -67,10 +67,15 @@ class ICMConfig(ExplorationConfig):
     needs_each_step: ClassVar[bool] = True  # its module learns once at each step
 
     learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
-    # beta: the forward model's share of the loss
-    forward_weight: float = option(0.05, fraction(), traced=True)
-    # eta: intrinsic reward for each unit of prediction error
-    reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
+    forward_weight: float = option(
+        0.05, fraction(), traced=True, help="beta: the forward model's share of the loss"
+    )
+    reward_scale: float = option(
+        0.03,
+        not_negative("it scales a bonus"),
+        traced=True,
+        help="eta: intrinsic reward for each unit of prediction error",
+    )
     feature_dim: int = option(32, counts("the models need units"))
     hidden_size: int = option(128, counts("the models need units"))
     num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
@@ -318,9 +323,12 @@ class CountBasedConfig(ExplorationConfig):
 
     states: ClassVar[str | None] = "discrete"
 
-    reward_scale: float = option(0.1, not_negative("it scales a bonus"))  # beta
-    # p: 1 in the paper's text, 0.5 in the authors' code
-    count_power: float = option(1.0, positive("the bonus would not fade"))
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"), help="beta")
+    count_power: float = option(
+        1.0,
+        positive("the bonus would not fade"),
+        help="p: 1 in the paper's text, 0.5 in the authors' code",
+    )
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""

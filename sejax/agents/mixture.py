@@ -26,12 +26,23 @@ class MixtureConfig(Options):
 
     group: ClassVar[str] = "agents"
 
-    # The incumbent's score, given its mean with each agent: the mean of those, or the worst.
-    aggregate: str = option("mean", one_of(AGGREGATES))
-    # How scores of several agents become comparable. advantage: a candidate's score less the
-    # incumbent's mean with the same agent; rank: its rank among that agent's candidates, less the
-    # incumbent's.
-    compared_by: str = option("advantage", one_of(COMPARED_BY))
+    aggregate: str = option(
+        "mean",
+        one_of(AGGREGATES),
+        help=(
+            "The incumbent's score, given its mean with each agent: the mean of those, or the "
+            "worst."
+        ),
+    )
+    compared_by: str = option(
+        "advantage",
+        one_of(COMPARED_BY),
+        help=(
+            "How scores of several agents become comparable. advantage: a candidate's score less "
+            "the incumbent's mean with the same agent; rank: its rank among that agent's "
+            "candidates, less the incumbent's."
+        ),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

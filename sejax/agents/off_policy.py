@@ -39,15 +39,18 @@ class OffPolicyOptions(AgentOptions):
     `preset=paper` has the paper's.
     """
 
-    batch_size: int = option(64, counts(), varied="triple")  # transitions
-    buffer_size: int = option(100_000, counts())  # steps
-    hidden_size: int = option(64, counts(), varied="triple")  # units of each hidden layer
+    batch_size: int = option(64, counts(), varied="triple", help="transitions")
+    buffer_size: int = option(100_000, counts(), help="steps")
+    hidden_size: int = option(64, counts(), varied="triple", help="units of each hidden layer")
     num_layers: int = option(1, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
-    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")  # of Adam
-    # Weight of the online network in the target's update.
-    tau: float = option(0.01, fraction(), traced=True)
-    discount: float = option(0.99, fraction(), traced=True)  # gamma
+    learning_rate: float = option(
+        1e-3, positive(MOVES), traced=True, varied="triple", help="of Adam"
+    )
+    tau: float = option(
+        0.01, fraction(), traced=True, help="Weight of the online network in the target's update."
+    )
+    discount: float = option(0.99, fraction(), traced=True, help="gamma")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,8 +78,8 @@ class ActorCriticOptions(OffPolicyOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    learning_rate: float = 3e-3  # of the actor, the critics and the temperature
-    action_repeat: int = option(1, counts())  # environment steps for each decision
+    learning_rate: float = option(3e-3, help="of the actor, the critics and the temperature")
+    action_repeat: int = option(1, counts(), help="environment steps for each decision")
 
     def spec(self) -> AgentSpec:
         return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)

@@ -62,23 +62,29 @@ class PPOConfig(TorsoOptions):
     activation: str = option("tanh", one_of(ACTIVATIONS))
     learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
-    # Decisions between two learning phases; null: as `update_episodes` says.
-    rollout_steps: int | None = option(128, counts())
-    update_episodes: int = option(10, counts())  # of full length, between two learning phases
-    epochs: int = option(10, counts())  # passes over the rollout in a learning phase
-    num_minibatches: int = option(4, counts())  # Adam steps in an epoch, each on its part of it
+    rollout_steps: int | None = option(
+        128,
+        counts(),
+        help="Decisions between two learning phases; null: as `update_episodes` says.",
+    )
+    update_episodes: int = option(10, counts(), help="of full length, between two learning phases")
+    epochs: int = option(10, counts(), help="passes over the rollout in a learning phase")
+    num_minibatches: int = option(
+        4, counts(), help="Adam steps in an epoch, each on its part of it"
+    )
     advantages: str = option("gae", one_of(ADVANTAGES))
-    gae_lambda: float = option(0.9, fraction(), traced=True)  # of advantages=gae
+    gae_lambda: float = option(0.9, fraction(), traced=True, help="of advantages=gae")
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
-    # Divides rewards by the running std of returns, with advantages=gae.
-    normalize_rewards: bool = True
-    # Norm that a longer gradient is scaled down to.
-    max_grad_norm: float | None = option(0.5, positive(MOVES))
+    normalize_rewards: bool = option(
+        True, help="Divides rewards by the running std of returns, with advantages=gae."
+    )
+    max_grad_norm: float | None = option(
+        0.5, positive(MOVES), help="Norm that a longer gradient is scaled down to."
+    )
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
-    # Of the Gaussian policy; learned.
-    init_action_std: float = option(0.5, positive(MOVES))
+    init_action_std: float = option(0.5, positive(MOVES), help="Of the Gaussian policy; learned.")
     action_repeat: int = option(1, counts())
 
     @classmethod

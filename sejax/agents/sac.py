@@ -42,14 +42,31 @@ class SACConfig(ActorCriticOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
-    # to meet a target entropy.
-    alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
+    alpha: float | None = option(
+        None,
+        not_negative("it weighs the entropy"),
+        traced=True,
+        help=(
+            "Temperature: what a nat of entropy is worth, in reward units. None: learned, as the "
+            "authors do to meet a target entropy."
+        ),
+    )
     init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
-    # Of actions in [-1, 1], in nats for each dimension; a uniform one's is the largest, log 2.
-    target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
-    # Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.
-    target_entropy_fraction: float = option(0.2, fraction(), traced=True)
+    target_entropy: float = option(
+        -1.0,
+        finite("the temperature must settle"),
+        traced=True,
+        help=(
+            "Of actions in [-1, 1], in nats for each dimension; a uniform one's is the largest, "
+            "log 2."
+        ),
+    )
+    target_entropy_fraction: float = option(
+        0.2,
+        fraction(),
+        traced=True,
+        help="Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.",
+    )
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions.

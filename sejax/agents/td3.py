@@ -38,13 +38,17 @@ class TD3Config(ActorCriticOptions):
     unless `noisy_tests` is set.
     """
 
-    policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
-    # Exploration, in units of the largest action.
-    action_noise_std: float = option(0.1, not_negative(), traced=True)
-    # Smoothing of the target policy, likewise.
-    target_noise_std: float = option(0.2, not_negative(), traced=True)
+    policy_delay: int = option(2, counts(), help="learning steps for each one of actor and targets")
+    action_noise_std: float = option(
+        0.1, not_negative(), traced=True, help="Exploration, in units of the largest action."
+    )
+    target_noise_std: float = option(
+        0.2, not_negative(), traced=True, help="Smoothing of the target policy, likewise."
+    )
     target_noise_clip: float = option(0.5, not_negative(), traced=True)
-    noisy_tests: bool = False  # exploration noise in tests too, as in the authors' code
+    noisy_tests: bool = option(
+        False, help="exploration noise in tests too, as in the authors' code"
+    )
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
@@ -66,13 +70,21 @@ class DiscreteTD3Config(TD3Config):
 
     activation: str = "tanh"
     learning_rate: float = 1e-3
-    layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
-    # Of the Gumbel-Softmax at the start.
-    temperature: float = option(1.0, positive(MOVES), traced=True)
-    final_temperature: float = option(0.05, fraction(), traced=True)  # as a fraction of it, ...
-    # ... reached linearly after so many updates
-    temperature_steps: int = option(2000, counts())
-    one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
+    layer_norm: bool = option(
+        True, help="after each hidden layer but the first, as in the authors' code"
+    )
+    temperature: float = option(
+        1.0, positive(MOVES), traced=True, help="Of the Gumbel-Softmax at the start."
+    )
+    final_temperature: float = option(
+        0.05, fraction(), traced=True, help="as a fraction of it, ..."
+    )
+    temperature_steps: int = option(
+        2000, counts(), help="... reached linearly after so many updates"
+    )
+    one_hot_actions: bool = option(
+        False, help="straight-through one-hot actions in place of soft ones"
+    )
 
     def make(self, task: Task) -> Agent:
         assert task.num_actions is not None

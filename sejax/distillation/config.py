@@ -38,28 +38,54 @@ class DistillConfig(Options):
 
     group: ClassVar[str] = ""
 
-    # null: one is searched. ppo:FILE.zip, of Stable-Baselines3; FILE.npz with kernel_0, bias_0 and
-    # so on; or module:function.
-    policy: str | None = None
-    # Of a policy that is not of the exact form.
-    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
-    # Of a linear policy.
-    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
-    # Of the SE's reward where actions are continuous: minus the distance to the policy's, or its
-    # square.
-    reward_form: str = option("distance", one_of(("distance", "quadratic")))
-    slope: float = option(1.0, positive("a reward must tell actions apart"))  # of the SE's reward
-    # Deviation of the SE's initial states, in units of those that the policy visits.
-    widen: float = option(1.0, positive("it is a scale"))
-    # Whether the numbers of an initial state are independent; else they have the visited states'
-    # covariance.
-    independent_starts: bool = False
-    # Policies that are taught: the best tested one of each of so many equal parts of the search.
-    num_snapshots: int = option(6, counts("something must be taught"))
-    # Students of each kind on the SE of each policy, which choose one of them.
-    num_students: int = option(4, counts("an SE is chosen by what it teaches"))
-    # Others of each kind, on the chosen SE.
-    num_tested: int = option(10, counts("a card says what an SE teaches"))
+    policy: str | None = option(
+        None,
+        help=(
+            "null: one is searched. ppo:FILE.zip, of Stable-Baselines3; FILE.npz with kernel_0, "
+            "bias_0 and so on; or module:function."
+        ),
+    )
+    copy: CopyConfig = option(CopyConfig(), help="Of a policy that is not of the exact form.")
+    search: SearchConfig = option(SearchConfig(), help="Of a linear policy.")
+    reward_form: str = option(
+        "distance",
+        one_of(("distance", "quadratic")),
+        help=(
+            "Of the SE's reward where actions are continuous: minus the distance to the policy's,"
+            " or its square."
+        ),
+    )
+    slope: float = option(
+        1.0, positive("a reward must tell actions apart"), help="of the SE's reward"
+    )
+    widen: float = option(
+        1.0,
+        positive("it is a scale"),
+        help="Deviation of the SE's initial states, in units of those that the policy visits.",
+    )
+    independent_starts: bool = option(
+        False,
+        help=(
+            "Whether the numbers of an initial state are independent; else they have the visited "
+            "states' covariance."
+        ),
+    )
+    num_snapshots: int = option(
+        6,
+        counts("something must be taught"),
+        help=(
+            "Policies that are taught: the best tested one of each of so many equal parts of the "
+            "search."
+        ),
+    )
+    num_students: int = option(
+        4,
+        counts("an SE is chosen by what it teaches"),
+        help="Students of each kind on the SE of each policy, which choose one of them.",
+    )
+    num_tested: int = option(
+        10, counts("a card says what an SE teaches"), help="Others of each kind, on the chosen SE."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,7 +26,7 @@ from sejax.options.plain import differences, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.io import fingerprint, save
 from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig, members_of
+from sejax.runs.config import LearnConfig
 
 ASKED = "distill.yaml"
 CHECKPOINT, KIND = "search.safetensors", "sejax_search"
@@ -290,22 +290,21 @@ def students(
     )
     # The file that `policy` names may have changed.
     taught_by = fingerprint({str(i): each for i, each in enumerate(weights)})
-    for member in members_of(config):
-        path = folder / "students" / f"{use}-{member.key}-{taught_by}.csv"
+    for key, agent_config in config.agents.items():
+        path = folder / "students" / f"{use}-{key}-{taught_by}.csv"
         if not path.exists():
-            agent = make_agent(member.agent, task, config.exploration)
-            print(f"training {len(keys) * len(lessons)} {member.key} students ...", flush=True)
+            agent = make_agent(agent_config, task, config.exploration)
+            print(f"training {len(keys) * len(lessons)} {key} students ...", flush=True)
             started = time.process_time()
             taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
-            new = teaching.as_rows(taught, lessons, member.key, use)
+            new = teaching.as_rows(taught, lessons, key, use)
             new = new.assign(cpu_s=(time.process_time() - started) / len(new))
             write_text(path, new.to_csv(index=False))
         rows = pd.read_csv(path)  # also new ones, so that both are the same
         found.append(rows)
         returns = teaching.counted(rows["test_return"])
         print(
-            f"{len(rows)} {member.key} students reach {returns.mean():.1f}, the worst "
-            f"{returns.min():.1f}",
+            f"{len(rows)} {key} students reach {returns.mean():.1f}, the worst {returns.min():.1f}",
             flush=True,
         )
     return pd.concat(found, ignore_index=True)

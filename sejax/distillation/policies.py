@@ -133,7 +133,7 @@ def _of_file(text: str) -> list[Layer]:
 
 
 def _of_function(text: str) -> Actor:
-    registry.require_typed("policy", text)
+    registry.require_path("policy", text)
     found = registry.imported("policy", text)
     require(
         callable(found),

@@ -35,12 +35,17 @@ class CopyConfig(Options):
 
     group: ClassVar[str] = "copy"
 
-    hidden_size: int = option(32, counts("0 is a linear copy", least=0))  # ReLUs; 0: a linear copy
+    hidden_size: int = option(
+        32, counts("0 is a linear copy", least=0), help="ReLUs; 0: a linear copy"
+    )
     rounds: int = option(4, counts("a copy is fitted at least once"))
-    episodes: int = option(8, counts("something must be seen"))  # of a round
-    # Of the copy in an episode, root mean square in units of the action's bound.
-    policy_error: float = option(0.1, not_negative("it is a size"))
-    steps: int = option(5000, counts("a copy is fitted"))  # of Adam in each round
+    episodes: int = option(8, counts("something must be seen"), help="of a round")
+    policy_error: float = option(
+        0.1,
+        not_negative("it is a size"),
+        help="Of the copy in an episode, root mean square in units of the action's bound.",
+    )
+    steps: int = option(5000, counts("a copy is fitted"), help="of Adam in each round")
     batch_size: int = option(256, counts("there is nothing to learn from otherwise"))
     learning_rate: float = option(3e-3, positive("the copy would not move"))
 

@@ -35,25 +35,47 @@ class SearchConfig(Options):
     group: ClassVar[str] = "search"
 
     generations: int = option(100, counts("something must be searched"))
-    # Searches that begin, each for so many generations (up to a test); the one whose policy was
-    # tested best goes on. A search may stop at a poor gait, which shows early.
-    num_starts: int = option(3, counts("a search begins"))
+    num_starts: int = option(
+        3,
+        counts("a search begins"),
+        help=(
+            "Searches that begin, each for so many generations (up to a test); the one whose "
+            "policy was tested best goes on. A search may stop at a poor gait, which shows early."
+        ),
+    )
     start_generations: int = option(40, counts("a start must be tried"))
-    num_directions: int = option(32, counts("something must be tried"))  # N, two episodes each
-    num_top: int = option(16, counts("something must be learned from"))  # b: directions that count
-    noise_std: float = option(0.03, positive("directions must differ"))  # nu
-    step_size: float = option(0.02, positive("the policy would not move"))  # alpha
-    # Share of the generations after which the step size declines, to a tenth at the end.
-    constant: float = option(0.5, not_negative("it is a share of the generations"))
-    # Root mean square of the error of an episode's policy, in units of the action's bound; of
-    # discrete actions in units of the policy's own outputs.
-    policy_error: float = option(0.1, not_negative("it is a size"))
-    # Subtracted from each step's reward while searching; null: the task's reward for being healthy.
-    alive_bonus: float | None = option(None, finite("it is a reward"))
-    # The first generations have shorter episodes.
-    short_steps: int | None = option(None, counts("an episode has steps"))
+    num_directions: int = option(32, counts("something must be tried"), help="N, two episodes each")
+    num_top: int = option(
+        16, counts("something must be learned from"), help="b: directions that count"
+    )
+    noise_std: float = option(0.03, positive("directions must differ"), help="nu")
+    step_size: float = option(0.02, positive("the policy would not move"), help="alpha")
+    constant: float = option(
+        0.5,
+        not_negative("it is a share of the generations"),
+        help="Share of the generations after which the step size declines, to a tenth at the end.",
+    )
+    policy_error: float = option(
+        0.1,
+        not_negative("it is a size"),
+        help=(
+            "Root mean square of the error of an episode's policy, in units of the action's "
+            "bound; of discrete actions in units of the policy's own outputs."
+        ),
+    )
+    alive_bonus: float | None = option(
+        None,
+        finite("it is a reward"),
+        help=(
+            "Subtracted from each step's reward while searching; null: the task's reward for "
+            "being healthy."
+        ),
+    )
+    short_steps: int | None = option(
+        None, counts("an episode has steps"), help="The first generations have shorter episodes."
+    )
     short_generations: int = option(0, counts("it counts generations", least=0))
-    num_tests: int = option(5, counts("a policy must be tested"))  # episodes without the error
+    num_tests: int = option(5, counts("a policy must be tested"), help="episodes without the error")
     test_every: int = option(10, counts("it counts generations"))
 
     def __post_init__(self) -> None:

@@ -35,8 +35,11 @@ class CliffWalking(Options):
         observation=Discrete(48), action=Discrete(4), max_steps=50, solved_reward=-20.0
     )
 
-    # Of the move into the goal: 0 in the authors' code; -1 in the paper's text.
-    goal_reward: float = option(0.0, finite("it is a reward"))
+    goal_reward: float = option(
+        0.0,
+        finite("it is a reward"),
+        help="Of the move into the goal: 0 in the authors' code; -1 in the paper's text.",
+    )
 
     def make(self) -> Task:
         from sejax.envs.dynamics.gridworld import GridParams, GridWorld

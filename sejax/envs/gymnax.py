@@ -33,8 +33,10 @@ class GymnaxTask(Options):
     group: ClassVar[str] = "env"
 
     name: str = f"{PREFIX}CartPole-v1"
-    solved_reward: float | None = None  # mean return that counts as solved; null: Gymnasium's
-    max_steps: int | None = option(None, counts("an episode has steps"))  # null: gymnax's
+    solved_reward: float | None = option(
+        None, help="mean return that counts as solved; null: Gymnasium's"
+    )
+    max_steps: int | None = option(None, counts("an episode has steps"), help="null: gymnax's")
 
     def make(self) -> Task:
         import gymnax

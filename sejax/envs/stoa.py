@@ -62,9 +62,14 @@ class StoaTask(Options):
     group: ClassVar[str] = "env"
 
     name: str = f"{PREFIX}navix/Navix-Empty-5x5-v0"
-    solved_reward: float | None = None  # mean return that counts as solved; null: undefined
-    # null: the environment's own, or 1,000 where it has none.
-    max_steps: int | None = option(None, counts("an episode has steps"))
+    solved_reward: float | None = option(
+        None, help="mean return that counts as solved; null: undefined"
+    )
+    max_steps: int | None = option(
+        None,
+        counts("an episode has steps"),
+        help="null: the environment's own, or 1,000 where it has none.",
+    )
 
     def make(self) -> Task:
         suite, _, name = self.name.removeprefix(PREFIX).partition("/")

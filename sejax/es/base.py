@@ -124,13 +124,16 @@ class StrategyOptions(Options):
 
     group: ClassVar[str] = "es"
 
-    # n_p: perturbations in a generation
     population_size: int = option(
-        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
+        16,
+        counts("scores are compared within a generation", 2, MOST_MEMBERS),
+        help="n_p: perturbations in a generation",
     )
-    num_evals: int = option(1, counts("a candidate needs a score"))  # agents on each candidate
-    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # how their scores become one
-    common_random_numbers: bool = False  # the same inner seeds for all candidates of a generation
+    num_evals: int = option(1, counts("a candidate needs a score"), help="agents on each candidate")
+    eval_aggregate: str = option("mean", one_of(AGGREGATES), help="how their scores become one")
+    common_random_numbers: bool = option(
+        False, help="the same inner seeds for all candidates of a generation"
+    )
 
     def evaluations(self, num_incumbent_evals: int) -> Evaluations:
         """How often each candidate is evaluated."""

@@ -54,14 +54,24 @@ class EvosaxConfig(StrategyOptions):
 
     name: str = option("open_es", one_of(ALGORITHMS))
     population_size: int = 32
-    # Agents trained on the distribution's mean.
-    num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
-    # Initial std of the search distribution.
-    noise_std: float = option(0.05, positive("candidates must differ", MAX_SCALE))
-    # Factor for each generation, of open_es alone.
-    noise_std_decay: float = option(1.0, shrinks())
-    # Learning rate of Adam on the mean, of open_es and pgpe.
-    step_size: float = option(0.05, positive("the mean would not move", MAX_SCALE))
+    num_incumbent_evals: int = option(
+        16,
+        counts("the incumbent's score selects the proxy"),
+        help="Agents trained on the distribution's mean.",
+    )
+    noise_std: float = option(
+        0.05,
+        positive("candidates must differ", MAX_SCALE),
+        help="Initial std of the search distribution.",
+    )
+    noise_std_decay: float = option(
+        1.0, shrinks(), help="Factor for each generation, of open_es alone."
+    )
+    step_size: float = option(
+        0.05,
+        positive("the mean would not move", MAX_SCALE),
+        help="Learning rate of Adam on the mean, of open_es and pgpe.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -25,24 +25,47 @@ class NESConfig(StrategyOptions):
     paper's.
     """
 
-    population_size: int = 64  # n_p: perturbations of a generation
-    # Agents on the incumbent; null: one for each perturbation, as in the paper.
-    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
-    # sigma: std of the weight perturbation
-    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE), traced=True)
-    # factor on sigma after each generation
-    noise_std_decay: float = option(0.97, shrinks(), traced=True)
-    # alpha: step size of the update
-    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE), traced=True)
-    # factor on alpha after each generation
-    step_size_decay: float = option(1.0, shrinks(), traced=True)
-    mirrored: bool = True  # each perturbation is tried as +eps and -eps and keeps its better sign
-    # A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.
-    score_transform: str | OwnTransform = option("all_better_2", require_transform)  # noqa: RUF009
-    # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
-    update_rule: str = option("authors", one_of(UPDATE_RULES))
-    # psi shrinks by this before each update
-    weight_decay: float = option(0.0, fraction(), traced=True)
+    population_size: int = option(64, help="n_p: perturbations of a generation")
+    num_incumbent_evals: int | None = option(
+        16,
+        counts("the incumbent's score selects the proxy"),
+        help="Agents on the incumbent; null: one for each perturbation, as in the paper.",
+    )
+    noise_std: float = option(
+        0.06,
+        positive("candidates must differ", MAX_SCALE),
+        traced=True,
+        help="sigma: std of the weight perturbation",
+    )
+    noise_std_decay: float = option(
+        0.97, shrinks(), traced=True, help="factor on sigma after each generation"
+    )
+    step_size: float = option(
+        1.0,
+        positive("the proxy would not move", MAX_SCALE),
+        traced=True,
+        help="alpha: step size of the update",
+    )
+    step_size_decay: float = option(
+        1.0, shrinks(), traced=True, help="factor on alpha after each generation"
+    )
+    mirrored: bool = option(
+        True, help="each perturbation is tried as +eps and -eps and keeps its better sign"
+    )
+    score_transform: str | OwnTransform = option(
+        "all_better_2",
+        require_transform,
+        names_code=True,
+        help="A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.",
+    )
+    update_rule: str = option(
+        "authors",
+        one_of(UPDATE_RULES),
+        help="authors: psi += alpha sum F eps; paper: that divided by n_p sigma",
+    )
+    weight_decay: float = option(
+        0.0, fraction(), traced=True, help="psi shrinks by this before each update"
+    )
 
     def make(self, num_dims: int) -> Strategy:
         """NES over vectors of `num_dims` numbers."""

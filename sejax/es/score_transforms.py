@@ -115,7 +115,7 @@ def require_transform(field: str, choice: object, default: object = None) -> Non
       ConfigError: for anything else. Nothing is imported.
     """
     if isinstance(choice, str) and ":" in choice:
-        registry.require_typed(field, choice)
+        registry.require_path(field, choice)
     elif not callable(choice) and choice not in [*TRANSFORMS]:
         raise unknown_name(field, choice, TRANSFORMS)
 

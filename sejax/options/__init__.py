@@ -1,8 +1,7 @@
 """Options: the fields of a configuration, their checks, and the errors that bad input raises.
 
 A configuration is a frozen dataclass that can make what it configures. Each of its fields is
-written once: name, type, default, and the rule that a value must obey. The comment above or beside
-a field is its help text, which `--help` shows.
+written once: name, type, default, the rule that a value must obey, and the text of `--help`.
 
 Every message has one form: the field, what must hold, why, what came, and how to fix it.
 
@@ -10,30 +9,25 @@ Example:
   >>> @dataclasses.dataclass(frozen=True, kw_only=True)
   ... class Config(Options):
   ...     group: ClassVar[str] = "agent"
-  ...     # Transitions of an update.
-  ...     batch_size: int = option(128, counts())
+  ...     batch_size: int = option(128, counts(), help="transitions of an update")
   >>> Config(batch_size=0)
   Traceback (most recent call last):
   sejax.options.ConfigError: agent.batch_size must be a whole number from 1 to 2147483647, because \
 there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=128.
 """
 
-import ast
 import contextlib
 import dataclasses
 import difflib
-import functools
-import inspect
-import io
 import numbers
 import os
+import re
 import sysconfig
 import textwrap
-import tokenize
 import traceback
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -60,6 +54,13 @@ class ConfigError(ValueError):
     def __init__(self, message: str, field: str = ""):
         super().__init__(message)
         self.field = field
+
+    def moved(self, group: str, where: str) -> "ConfigError":
+        """The same error of fields that stand elsewhere, as `agents.ddqn` for `agent`."""
+        if group in ("", where):
+            return self
+        at_fault = re.sub(rf"^{group}\b", where, self.field)
+        return ConfigError(re.sub(rf"\b{group}(?=\.\w| must )", where, str(self)), at_fault)
 
 
 class FailedError(RuntimeError):
@@ -145,22 +146,27 @@ _LIBRARIES = (
 
 
 def option(
-    default: Any,
+    default: Any = dataclasses.MISSING,
     rule: Rule | None = None,
     *,
+    help: str = "",
     traced: bool = False,
     varied: str | None = None,
+    names_code: bool = False,
 ) -> Any:
     """A dataclass field.
 
     Args:
-      default: its default.
+      default: its default; without one it must be given.
       rule: what must hold; None passes it where that is the default or `... | None` the type.
+      help: what `--help` says of it.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
+      names_code: whether its text may be a `module:attribute`, which no file may name.
     """
-    metadata = {"rule": rule, "traced": traced, "varied": varied}
+    metadata = {"rule": rule, "traced": traced, "varied": varied, "names_code": names_code}
+    metadata |= {"help": help} if help else {}  # else that of the class which a subclass overrides
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -217,34 +223,10 @@ def marks(cls: type, name: str) -> dict[str, Any]:
     return found
 
 
-@functools.cache
-def help_texts(cls: type) -> Mapping[str, str]:
-    """The comments above and beside a class's fields, by their names; as `tyro` reads them."""
-    texts: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        with contextlib.suppress(OSError, TypeError, SyntaxError):  # without its source
-            texts |= _comments(textwrap.dedent(inspect.getsource(base)))
-    return texts
-
-
-def _comments(source: str) -> dict[str, str]:
-    comments = {
-        token.start[0]: (token.string.lstrip("# "), not token.line[: token.start[1]].strip())
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
-    found: dict[str, str] = {}
-    (definition,) = ast.parse(source).body
-    for node in getattr(definition, "body", ()):
-        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
-            continue
-        first = node.lineno
-        while comments.get(first - 1, ("", False))[1]:
-            first -= 1
-        last = node.end_lineno or node.lineno
-        lines = [comments[line][0] for line in range(first, last + 1) if line in comments]
-        found |= {node.target.id: " ".join(lines)} if lines else {}
-    return found
+def help_texts(cls: type) -> dict[str, str]:
+    """What `--help` says of a dataclass's fields, by their names."""
+    texts = {x.name: marks(cls, x.name).get("help", "") for x in dataclasses.fields(cls)}
+    return {name: text for name, text in texts.items() if text}
 
 
 def is_number(value: object) -> bool:

@@ -1,36 +1,37 @@
 """Plain values and dataclasses: what files and overrides hold, read by the types of the fields.
 
 A configuration is written as plain values (`to_plain`): numbers, texts, None, lists, dictionaries.
-It is read back (`from_plain`) by the types of its fields: `1` for a float, a list for a tuple, the
-text of an override for a number. Nothing is guessed, resolved, imported or executed.
+It is read back (`from_plain`) by the types of its fields, which pydantic converts to: `1` for a
+float, a list for a tuple, the text of an override for a number. Nothing is imported or executed.
 """
 
 import dataclasses
+import functools
 import os
 import re
-import types
 import typing
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
 from sejax.options import (
     ConfigError,
     as_text,
+    is_number,
     listed,
+    marks,
     nearest,
     require,
     shortened,
     told,
-    unknown_name,
 )
 
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-_NO = object()  # what a value of another type is converted to
 
 
 # --- dataclasses ---------------------------------------------------------------------------------
@@ -50,18 +51,20 @@ def to_plain(value: object) -> Any:
     return value
 
 
-def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
+def from_plain(
+    cls: type[T], values: Mapping[str, Any], where: str, imports: Collection[str] | None = None
+) -> T:
     """Inverse of `to_plain`.
 
     Args:
       cls: a dataclass.
       values: by the names of its fields; those left out have their defaults.
       where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
+      imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
       ConfigError: for a field that is not there, is missing, or has a value of another type.
     """
-    fields = fields_of(cls)
     try:
         hints = typing.get_type_hints(cls)
     except NameError as error:
@@ -70,16 +73,36 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
             "that type where the class is defined.",
             where,
         ) from error
+    fields, read = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in fields}
-    read = {}
     for name, value in values.items():
         if name not in fields:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        read[name] = _read(value, hints[name], full[name], fields[name])
-    for name in fields.keys() - read.keys():
-        is_open = fields[name] is not MISSING
+        if marks(cls, name).get("names_code") and ":" in str(value):
+            require_typed(full[name], str(value), imports)
+        read[name] = _read(value, hints[name], full[name], fields[name], imports)
+    for name, default in fields.items():
+        is_open = name in read or default is not MISSING
         require(is_open, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
-    return cls(**read)
+    try:
+        return cls(**read)
+    except ConfigError as error:
+        raise error.moved(getattr(cls, "group", where), where) from None
+
+
+def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
+    """Checks that `module:attribute` may be imported; imports nothing.
+
+    Raises:
+      ConfigError: if it is not one of `imports`.
+    """
+    require(
+        imports is None or path in imports,
+        field,
+        "must be typed on the command line if it is of a module of your own: what a file names is "
+        f"never imported; got {shortened(path, 60)}. Set {field}={shortened(path, 60)}, if you "
+        "trust it.",
+    )
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -99,79 +122,37 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     return ConfigError(f"{field} is no field.{fix} Fields: {listed(ranked)}.", field)
 
 
-def _read(value: Any, hint: Any, name: str, default: Any) -> Any:
-    """A value as its field's type, or an error that says which that is."""
-    kinds = typing.get_args(hint) if is_union(hint) else (hint,)
-    if types.NoneType in kinds and (value is None or value == "null"):
-        return None
-    *others, last = (kind for kind in kinds if kind is not types.NoneType)
-    if type(value) in (*others, last) and not isinstance(value, str):
-        return value
-    for kind in others:
-        with suppress(ConfigError):
-            return _as(kind, value, name, default)
-    return _as(last, value, name, default)
-
-
-def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
-    """A value as one type."""
-    origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
+def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
+    """A value as its field's type, which pydantic converts; an error says what it must be."""
+    candidates: tuple[Any, ...] = (value,)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
+        is_read = isinstance(value, hint | Mapping)
+        require(is_read, name, f"must {fields}; got {shortened(repr(value))}. Leave it out.")
+        return value if isinstance(value, hint) else from_plain(hint, value, name, imports)
+    if isinstance(value, str):
+        text = expanded(value)
+        candidates = parsed(text), text
+    elif is_number(value):  # or a name of digits, as of a folder
+        candidates = value, str(value)
+    must = "be no true or false"
+    for candidate in candidates:
+        try:
+            read = _adapter(hint).validate_python(candidate)
+        except ValidationError as error:
+            must = error.errors()[0]["msg"].removeprefix("Input should ")
+        else:
+            if isinstance(candidate, bool) == isinstance(read, bool):  # which are numbers in Python
+                return read
     is_open = default is MISSING or dataclasses.is_dataclass(default)
     fix = "VALUE" if is_open else as_text(to_plain(default))
-
-    def needs(holds: bool, must: str) -> None:
-        require(holds, name, f"must {must}; got {shortened(repr(value))}. Set {name}={fix}.")
-
-    if kind is Any:
-        return parsed(value) if isinstance(value, str) else value
-    if origin is typing.Literal:
-        read = parsed(value) if isinstance(value, str) and value not in arguments else value
-        if read not in arguments:
-            raise unknown_name(name, value, map(str, arguments))
-        return read
-    if origin in (tuple, list):
-        items = parsed(value) if isinstance(value, str) else value
-        needs(isinstance(items, list | tuple), "be a list")
-        if isinstance(value, str):  # each is read by its own type
-            items = split(value[1:-1]) if items else []
-        if origin is tuple and arguments and arguments[-1] is not Ellipsis:
-            needs(len(items) == len(arguments), f"have {len(arguments)} values")
-        else:
-            arguments = (*arguments, Any)[:1] * len(items)
-        each = zip(items, arguments, strict=True)
-        return origin(_read(item, argument, name, default) for item, argument in each)
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        if isinstance(value, kind):
-            return value
-        needs(isinstance(value, Mapping), f"have fields, as {name}.{next(iter(fields_of(kind)))}")
-        return from_plain(kind, value, name)
-    if kind not in _KINDS:
-        return value
-    if isinstance(value, Mapping) and value:
-        own = f"{name}.{next(iter(value))}"
-        require(False, name, f"must be {_KINDS[kind]}, without fields; got {own}. Leave {own} out.")
-    scalar = _scalar(value, kind)
-    needs(scalar is not _NO, f"be {_KINDS[kind]}")
-    return scalar
+    got = shortened(repr(value))
+    raise ConfigError(f"{name} must {must}; got {got}. Set {name}={fix}.", name)
 
 
-def _scalar(value: Any, kind: type) -> Any:
-    """A value as a bool, int, float or str; `_NO` if it is none."""
-    if kind is str:
-        is_name = type(value) in (int, float)  # a name of digits, as of a folder
-        return expanded(value) if isinstance(value, str) else str(value) if is_name else _NO
-    if isinstance(value, str):
-        value = parsed(value)
-    if kind is float and type(value) is int and abs(value) < 2**1000:
-        return float(value)
-    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
-        return int(value)
-    return value if type(value) is kind else _NO
-
-
-def is_union(hint: object) -> bool:
-    """Whether a type is one of several, such as `int | None`."""
-    return typing.get_origin(hint) in (types.UnionType, typing.Union)
+@functools.cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
 
 
 # --- nested dictionaries -------------------------------------------------------------------------
@@ -186,12 +167,13 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested settings with changes over them."""
-    merged = dict(base)
-    for key, value in changes.items():
-        nested = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
-        merged[key] = merge(base[key], value) if nested else value
+def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested settings, each layer over those before it."""
+    merged: dict[str, Any] = {}
+    for layer in layers:
+        for key, value in layer.items():
+            is_nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+            merged[key] = merge(merged[key], value) if is_nested else value
     return merged
 
 

@@ -18,14 +18,13 @@ group         entry points            `make(...)` gives
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
-`module:attribute`, which imports the module. Within `only_typed`, as in every command, that is done
-only for a `module:attribute` that the user has typed: one that a file holds is refused.
+`module:attribute`, which imports the module. What reads a file says which of these may be imported
+(`imports`): those that the user has typed, or none.
 
 A configuration is written as plain values (`describe`) and read back (`configure`); what a value
 may be is in `sejax.options.plain`.
 """
 
-import contextlib
 import dataclasses
 import functools
 import importlib
@@ -35,8 +34,7 @@ import inspect
 import operator
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextvars import ContextVar
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,7 +49,7 @@ from sejax.options import (
     told,
     unknown_name,
 )
-from sejax.options.plain import MISSING, fields_of, from_plain, to_plain
+from sejax.options.plain import MISSING, fields_of, from_plain, require_typed, to_plain
 
 
 @dataclass(frozen=True)
@@ -180,26 +178,7 @@ GROUPS = {
 }
 
 
-# What may be imported by its name; None outside of commands, where Python code says it itself.
-_TYPED: ContextVar[frozenset[str] | None] = ContextVar("typed", default=None)
 _PATH = re.compile(r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])")
-
-
-@contextlib.contextmanager
-def only_typed(words: Iterable[str]) -> Iterator[None]:
-    """Within it, `module:attribute` is imported only if one of these words has it.
-
-    For commands and all that reads files of unknown origin. The outermost one decides: what reads a
-    file on behalf of a command allows nothing more.
-    """
-    if _TYPED.get() is not None:
-        yield
-        return
-    before = _TYPED.set(frozenset(paths_in(words)))
-    try:
-        yield
-    finally:
-        _TYPED.reset(before)
 
 
 def paths_in(words: Iterable[str]) -> list[str]:
@@ -210,12 +189,6 @@ def paths_in(words: Iterable[str]) -> list[str]:
       ['mine:Room', 'mine:A']
     """
     return [path for word in words for path in _PATH.findall(word)]
-
-
-def untyped(words: Iterable[str]) -> list[str]:
-    """Each `module:attribute` in words that is not imported here, as the user has not typed it."""
-    typed = _TYPED.get()
-    return [] if typed is None else [path for path in paths_in(words) if path not in typed]
 
 
 # --- names ---------------------------------------------------------------------------------------
@@ -231,16 +204,17 @@ def is_registered(group: str, name: str) -> bool:
     return name in names(group) or _by_prefix(group, name) is not None
 
 
-def find(group: str, name: object) -> Any:
+def find(group: str, name: object, imports: Collection[str] | None = None) -> Any:
     """The dataclass that a name stands for.
 
     Args:
       group: one of `GROUPS`.
-      name: see the module. `module:attribute` is imported, if `only_typed` does not forbid it.
+      name: see the module.
+      imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
-      ConfigError: for an unknown name, a module that cannot be imported or that the user has not
-        typed, or an attribute that is no plugin.
+      ConfigError: for an unknown name, a module that cannot or may not be imported, or an
+        attribute that is no plugin.
     """
     kind = GROUPS[group]
     if not isinstance(name, str):
@@ -254,7 +228,8 @@ def find(group: str, name: object) -> Any:
         is_path = "." in name and name.replace(".", "_").isidentifier()
         meant = [":".join(name.rsplit(".", 1))] if is_path else []
         raise unknown_name(group, name, [*names(group), *meant])
-    require_typed(group, name)
+    require_path(group, name)
+    require_typed(group, name, imports)
     return _as_dataclass(group, name, imported(group, name))
 
 
@@ -268,8 +243,19 @@ def name_of(group: str, config: object) -> str:
     return _NAMES.get(cls) or next(built_in, own)
 
 
-def configure(group: str, values: Mapping[str, Any]) -> Any:
+def configure(
+    group: str,
+    values: Mapping[str, Any],
+    imports: Collection[str] | None = None,
+    where: str = "",
+) -> Any:
     """The configuration that plain values describe: the field `name`, and those of the plugin.
+
+    Args:
+      group: one of `GROUPS`.
+      values: by the names of the fields.
+      imports: each `module:attribute` that may be imported; None: any.
+      where: what messages call it, if not by its group.
 
     Raises:
       ConfigError: for an unknown name or field, or a value that cannot be.
@@ -278,14 +264,15 @@ def configure(group: str, values: Mapping[str, Any]) -> Any:
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
       0.9
     """
+    where = where or group
     require(
         isinstance(values, Mapping) and "name" in values,
-        group,
+        where,
         f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME.",
     )
-    cls = find(group, values["name"])
+    cls = find(group, values["name"], imports)
     fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
-    return from_plain(cls, fields, group)
+    return from_plain(cls, fields, where, imports)
 
 
 def describe(group: str, config: object) -> dict[str, Any]:
@@ -378,32 +365,26 @@ def _attribute(path: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def require_typed(field: str, path: str) -> None:
-    """Checks that `module:attribute` may be imported; imports nothing.
+def require_path(field: str, path: str) -> None:
+    """Checks that a text is of the form `module:attribute`.
 
     Raises:
-      ConfigError: for text of another form, or one that the user has not typed (`only_typed`).
+      ConfigError: if it is not.
     """
     module, _, attribute = path.partition(":")
-    got, typed = shortened(path, 60), _TYPED.get()
     parts = [*module.split("."), *attribute.split(".")]
     own = module.removesuffix(".py").replace("/", ".").strip(".")
     fix = f"{own}:{attribute}" if own.replace(".", "_").isidentifier() else "my_module:MyClass"
     require(
         all(map(str.isidentifier, parts)) and not module.endswith(".py"),
         field,
-        f"must be a name or module:attribute; got {got}. Set {field}={shortened(fix, 60)}.",
-    )
-    require(
-        typed is None or path in typed,
-        field,
-        "must be typed on the command line if it is of a module of your own: what a file names is "
-        f"never imported; got {got}. Set {field}={got}, if you trust it.",
+        f"must be a name or module:attribute; got {shortened(path, 60)}. Set "
+        f"{field}={shortened(fix, 60)}.",
     )
 
 
 def imported(field: str, path: str) -> Any:
-    """What `module:attribute` names; `require_typed` has been asked before.
+    """What `module:attribute` names, which is imported.
 
     Raises:
       ConfigError: if the module cannot be imported, or has nothing of this name.

@@ -70,33 +70,71 @@ class SyntheticConfig(ProxyConfig):
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    # How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 - d
-    # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
-    # with probability sigmoid(d). Agents see all ends but the first.
-    done: str = option("threshold", one_of(DONE_MODES))
-    # First step of an episode that d may end it at; before it, targets bootstrap with 1. An SE of
-    # episodes of a step or two is a bandit, whatever its networks could do.
-    min_steps: int = option(1, counts("an episode has steps"))
-    # real: the task's initial states; learned: standard normal noise plus a network's output for
-    # it; noise: noise alone, in the units of `state_units`.
-    initial_state: str = option("learned", one_of(INITIAL_STATES))
-    # Units in which the networks see and make states. raw: the task's own; bounds: 0 is the middle
-    # of a bounded observation and 1 is half of the way to its bound. A car's velocity lies in
-    # [-0.07, 0.07], where noise of 1 would be no measure.
-    state_units: str = option("raw", one_of(STATE_UNITS))
-    # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
-    # next-state nor a done network.
-    horizon: int | None = option(1, counts("an episode has steps"))
-    # What the reward network of a bandit makes. network: the reward of an action; distance,
-    # quadratic: the best of continuous actions, in units of their bound, from which the reward is
-    # minus the sum of the distances, or of their squares, so that the best policy is known.
-    reward_form: str = option("network", one_of(REWARD_FORMS))
-    # What such a reward takes for each unit of it.
-    reward_slope: float = option(1.0, positive("a reward must tell actions apart"))
+    done: str = option(
+        "threshold",
+        one_of(DONE_MODES),
+        help=(
+            "How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with "
+            "1 - d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, "
+            "1); sigmoid: with probability sigmoid(d). Agents see all ends but the first."
+        ),
+    )
+    min_steps: int = option(
+        1,
+        counts("an episode has steps"),
+        help=(
+            "First step of an episode that d may end it at; before it, targets bootstrap with 1. "
+            "An SE of episodes of a step or two is a bandit, whatever its networks could do."
+        ),
+    )
+    initial_state: str = option(
+        "learned",
+        one_of(INITIAL_STATES),
+        help=(
+            "real: the task's initial states; learned: standard normal noise plus a network's "
+            "output for it; noise: noise alone, in the units of `state_units`."
+        ),
+    )
+    state_units: str = option(
+        "raw",
+        one_of(STATE_UNITS),
+        help=(
+            "Units in which the networks see and make states. raw: the task's own; bounds: 0 is "
+            "the middle of a bounded observation and 1 is half of the way to its bound. A car's "
+            "velocity lies in [-0.07, 0.07], where noise of 1 would be no measure."
+        ),
+    )
+    horizon: int | None = option(
+        1,
+        counts("an episode has steps"),
+        help=(
+            "Steps of an episode; null: the task's limit. 1: a contextual bandit, which has "
+            "neither a next-state nor a done network."
+        ),
+    )
+    reward_form: str = option(
+        "network",
+        one_of(REWARD_FORMS),
+        help=(
+            "What the reward network of a bandit makes. network: the reward of an action; "
+            "distance, quadratic: the best of continuous actions, in units of their bound, from "
+            "which the reward is minus the sum of the distances, or of their squares, so that the"
+            " best policy is known."
+        ),
+    )
+    reward_slope: float = option(
+        1.0,
+        positive("a reward must tell actions apart"),
+        help="What such a reward takes for each unit of it.",
+    )
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
-    # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or truncates
-    # it, as the task's limit does.
-    horizon_is_terminal: bool = True
+    horizon_is_terminal: bool = option(
+        True,
+        help=(
+            "Whether the horizon terminates an episode, so that nothing is bootstrapped there, or"
+            " truncates it, as the task's limit does."
+        ),
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -249,11 +287,18 @@ class RewardConfig(ProxyConfig):
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
-    # Phi is this times the network's output. Some agents learn only from small rewards
-    # (docs/results.md, MountainCarContinuous).
-    output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
-    augmented: bool = False  # the network sees the task's vector v as well
-    zero_at_terminal: bool = False  # Phi is 0 where episodes end for the agent; see RewardEnv
+    output_scale: float = option(
+        1.0,
+        positive("a reward of 0 teaches nothing", 1e6),
+        help=(
+            "Phi is this times the network's output. Some agents learn only from small rewards "
+            "(docs/results.md, MountainCarContinuous)."
+        ),
+    )
+    augmented: bool = option(False, help="the network sees the task's vector v as well")
+    zero_at_terminal: bool = option(
+        False, help="Phi is 0 where episodes end for the agent; see RewardEnv"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

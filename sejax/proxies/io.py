@@ -72,7 +72,10 @@ class _Loaded:
           0.8
         """
         one_of(registry.GROUPS)("group", str(group), None)
-        return header.configured(group, self.config.get(group), self.path.name)
+        learned = agents_of(self.config)
+        one = next(iter(learned.values())) if len(learned) == 1 else None
+        values = one if group == "agent" else self.config.get(group)
+        return header.configured(group, values, self.path.name)
 
     def learned_agents(self) -> dict[str, Any]:
         """The agent that it was learned with, or the mixture of agents, by their keys.

@@ -16,7 +16,6 @@ from sejax.options import (
     ConfigError,
     FailedError,
     place_of,
-    registry,
     require,
     shortened,
     told,
@@ -34,8 +33,6 @@ def start(
 ) -> None:
     """Runs a command on the words of the command line; errors become a message and an exit code.
 
-    Only a `module:attribute` that is typed there is imported.
-
     Args:
       main: the command, a function of its overrides.
       help_text: what `--help` prints beside these overrides.
@@ -44,7 +41,7 @@ def start(
     words = sys.argv[1:]
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
-    with messages(), registry.only_typed(words):
+    with messages():
         options = [*HELP, *([PRINT_CONFIG] if config_text else [])]
         overrides = _prepared(words, options)
         if {*HELP} & {*words}:

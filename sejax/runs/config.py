@@ -1,12 +1,12 @@
-"""A command's configuration: from the overrides that a user types to typed, validated dataclasses.
+"""A command's configuration: from the words that a user types to typed, validated dataclasses.
 
-An override is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` merges
-them with a preset into nested plain values; `sejax.options.registry` makes dataclasses of those,
-each value read by its field's type; the dataclasses check themselves.
+A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` lays them on a
+preset, which gives nested plain values; `sejax.options.registry` makes dataclasses of those, each
+value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -19,8 +19,6 @@ from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
     Options,
-    as_text,
-    between,
     counts,
     one_of,
     option,
@@ -29,8 +27,19 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import flatten, from_plain, to_plain
-from sejax.runs.compose import DEFAULTS, compose, key_of, mixture_of, named, read
+from sejax.options.plain import fields_of, flatten, from_plain, to_plain
+from sejax.proxies import header
+from sejax.runs.compose import (
+    DEFAULTS,
+    Composed,
+    Share,
+    agents_of,
+    compose,
+    errors_of,
+    field_of,
+    key_of,
+    read,
+)
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -38,78 +47,8 @@ EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
-JOINT = "+"  # between the agents of a mixture, in names
+JOINT = "+"  # between several agents, in names
 Schema = TypeVar("Schema", bound="CommandConfig")
-
-
-# --- the agents of a run -------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class MixtureMember(Options):
-    """One of the agents of a configuration.
-
-    Attributes:
-      key: its name in tables and metrics.
-      field: its name in overrides and messages.
-      agent: its configuration.
-      weight: its share of a generation's candidates; with 0 it only judges incumbents.
-    """
-
-    group: ClassVar[str] = "agent"
-
-    key: str
-    field: str
-    agent: AgentConfig
-    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class AgentsConfig(MixtureConfig):
-    """A mixture of agents, sorted by their keys."""
-
-    members: tuple[MixtureMember, ...]
-
-
-_SHARED = tuple(field.name for field in dataclasses.fields(MixtureConfig))
-
-
-def _agents_from_plain(values: object) -> AgentsConfig | None:
-    """The mixture that plain values describe: `_SHARED` fields, and each agent's under its key."""
-    if values is None:
-        return None
-    by_key = {str(k): x for k, x in values.items()} if isinstance(values, Mapping) else {}
-    shared = {name: by_key.pop(name) for name in _SHARED if name in by_key}
-    require(
-        by_key,
-        "agents",
-        f"must be a list of agents; got {shortened(values)}. Set agents=[ddqn,ppo].",
-    )
-    members = tuple(_member(key, by_key[key]) for key in sorted(by_key))
-    shared = to_plain(from_plain(MixtureConfig, shared, "agents"))
-    return AgentsConfig(members=members, **shared)
-
-
-def _member(key: str, values: object) -> MixtureMember:
-    field = f"agents.{key}"
-    require(
-        key == key_of(key),
-        field,
-        f"must be a word, as columns are named by it; got {shortened(key)}. Set agents=[ddqn,ppo].",
-    )
-    with named(field):
-        fields = dict(values) if isinstance(values, Mapping) else {}
-        member = {"key": key, "field": field, "weight": fields.pop("weight", 1.0)}
-        agent = registry.configure("agent", fields)
-        return from_plain(MixtureMember, member | {"agent": agent}, "agent")
-
-
-def members_of(config: "CommandConfig") -> tuple[MixtureMember, ...]:
-    """The agents of a command's configuration: several, or the one."""
-    if config.agents is not None:
-        return config.agents.members
-    key = registry.name_of("agent", config.agent)
-    return (MixtureMember(key=key, field="agent", agent=config.agent),)
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -121,27 +60,45 @@ class CommandConfig(Options):
 
     Attributes:
       groups: the groups of plugins whose choices are fields.
-      learns: whether proxies are learned: presets have settings, a mixture's agents have shares.
+      learns: whether proxies are learned: presets have settings, several agents have shares.
+      made: fields that are made of `agents`, the only one of them in words and files.
+      agents: by their keys, in the order of these; see `sejax.runs.compose.agents_of`.
     """
 
     groups: ClassVar[tuple[str, ...]] = ()
     learns: ClassVar[bool] = False
+    made: ClassVar[tuple[str, ...]] = ("agents", "weights", "mixture")
 
-    agent: Any = None  # trains on the proxies; null with `agents`
-    agents: AgentsConfig | None = None  # several agents in place of one: agents=[ddqn,ppo]
-    exploration: ExplorationConfig  # intrinsic reward of the agents
-    training: TrainingConfig = TRAINING  # on proxies
+    agents: dict[str, AgentConfig]
+    exploration: ExplorationConfig = option(help="intrinsic reward of the agents")
+    training: TrainingConfig = option(TRAINING, help="on proxies")
     seed: int = option(0, seed())
-    # Agents that train side by side on one device; null: what suits the agent and the device.
-    num_parallel: int | None = option(None, counts("something must compute"))
-    devices: int | None = option(None, counts("something must compute"))  # null: all
+    num_parallel: int | None = option(
+        None,
+        counts("something must compute"),
+        help=(
+            "Agents that train side by side on one device; null: what suits the agent and the "
+            "device."
+        ),
+    )
+    devices: int | None = option(None, counts("something must compute"), help="null: all")
+
+    @property
+    def agent(self) -> Any:
+        """The agent's configuration, where it is one alone."""
+        (agent,) = self.agents.values()
+        return agent
+
+    def field_of(self, key: str) -> str:
+        """The name of an agent's fields in words and messages."""
+        return field_of(key, self.agents)
 
     @staticmethod
-    def spec_for(given: Mapping[str, Any]) -> TaskSpec:
-        """The task of overrides, whose default agent is taken."""
+    def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:
+        """The task of words, whose default agent is taken."""
         fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
         name = given.get("env", DEFAULTS["env"])
-        return envs.spec_of(registry.configure("env", {**fields, "name": name}))
+        return envs.spec_of(registry.configure("env", {**fields, "name": name}, imports))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,25 +116,42 @@ class LearnConfig(CommandConfig):
         *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
     )
 
-    preset: str = "best"  # settings that were measured (best) or published (paper)
-    env: Any  # the real task
-    proxy: Any  # what is learned: a synthetic environment (se) or a reward network (rn)
-    es: Any  # the evolution strategy of the outer loop
-    objective: Any  # what the outer loop maximises
-    tracker: Any  # follows the run beside its files
-    machines: Any  # where agents train
-    # default: the agent's; varied: learning rate, batch and network drawn anew for each training.
-    agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
-    # n_o: steps of the outer loop.
-    generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
-    # Independent runs, with seeds seed, seed + 1, ...
-    num_seeds: int = option(1, counts("it counts runs"))
-    # End a run at its first incumbent mean that reaches the solved threshold.
-    stop_when_solved: bool = False
+    weights: tuple[float, ...] = ()  # of the agents; equal if not given
+    mixture: MixtureConfig = option(MixtureConfig())
+    preset: str = option("best", help="settings that were measured (best) or published (paper)")
+    env: Any = option(help="the real task")
+    proxy: Any = option(
+        help="what is learned: a synthetic environment (se) or a reward network (rn)"
+    )
+    es: Any = option(help="the evolution strategy of the outer loop")
+    objective: Any = option(help="what the outer loop maximises")
+    tracker: Any = option(help="follows the run beside its files")
+    machines: Any = option(help="where agents train")
+    agent_hparams: str = option(
+        "default",
+        one_of(AGENT_HPARAMS),
+        help=(
+            "default: the agent's; varied: learning rate, batch and network drawn anew for each "
+            "training."
+        ),
+    )
+    generations: int = option(
+        100,
+        counts("there is nothing to do otherwise", most=1_000_000),
+        help="n_o: steps of the outer loop.",
+    )
+    num_seeds: int = option(
+        1, counts("it counts runs"), help="Independent runs, with seeds seed, seed + 1, ..."
+    )
+    stop_when_solved: bool = option(
+        False, help="End a run at its first incumbent mean that reaches the solved threshold."
+    )
     checkpoint_every: int = option(
-        1, counts("it counts generations")
-    )  # generations between checkpoints
-    run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
+        1, counts("it counts generations"), help="generations between checkpoints"
+    )
+    run_dir: str | None = option(
+        None, help="null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,23 +176,23 @@ class LearnConfig(CommandConfig):
         max_steps = self.proxy.max_steps(spec.max_steps)
         if not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, max_steps)
-        for member in members_of(self):
-            with named(member.field):
-                agents.require_fit(member.agent, self.exploration, spec, task_name)
+        for key, agent in self.agents.items():
+            with errors_of("agent", self.field_of(key)):
+                agents.require_fit(agent, self.exploration, spec, task_name)
                 if self.proxy.reaches_step_limit:
                     limits = max_steps, spec.max_steps
-                    require_learning("training", self.training, member.agent, *limits)
+                    require_learning("training", self.training, agent, *limits)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
         if group == "agent":
-            return JOINT.join(member.key for member in members_of(self))
+            return JOINT.join(self.agents)
         return registry.name_of(group, getattr(self, group))
 
     @property
     def scored_agents(self) -> tuple[str, ...]:
         """The agents that have scores of their own."""
-        return tuple(member.key for member in members_of(self))
+        return tuple(self.agents)
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -245,13 +219,15 @@ class LearnConfig(CommandConfig):
 
     def _learners(self, task: envs.Task) -> Agent | Mixture:
         """The agent, or the mixture of agents, that trains on the proxies."""
-        varied, each = self.agent_hparams == "varied", members_of(self)
-        made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
-        if self.agents is None:
-            return made[0]
-        names, weights = tuple(x.key for x in each), tuple(x.weight for x in each)
-        shared = self.agents or MixtureConfig()
-        return Mixture(agents=made, names=names, weights=weights, config=shared)
+        is_varied = self.agent_hparams == "varied"
+        learners = tuple(
+            agents.make_agent(agent, task, self.exploration, is_varied)
+            for agent in self.agents.values()
+        )
+        if len(learners) == 1:
+            return learners[0]
+        names = tuple(self.agents)
+        return Mixture(agents=learners, names=names, weights=self.weights, config=self.mixture)
 
     @property
     def resolved_run_dir(self) -> Path:
@@ -268,32 +244,50 @@ class LearnConfig(CommandConfig):
 class EvaluateConfig(CommandConfig):
     """What `sejax.evaluate` takes."""
 
-    groups: ClassVar[tuple[str, ...]] = ("agent", "exploration")
+    groups: ClassVar[tuple[str, ...]] = ("exploration",)
 
-    proxy: str  # a run directory, a safetensors file, a shipped name (cartpole), or real
-    env: str | None = None  # the task, where proxy=real or the proxy's is your own
-    proxy_kind: str | None = None  # my_module:MyProxy, where the proxy is of a kind of your own
-    # as_learned: agents and exploration that the proxy was learned with, where no agent is named;
-    # default: the agent's; varied: drawn around them for each agent.
-    agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
-    # How long agents train on the proxy. proxy: on an SE as it was learned with, on a reward
-    # network as on the real task (as_learned: with the time limit as in its run); config: as
-    # `training` says.
-    training_from: str = option("proxy", one_of(TRAINING_FROM))
+    proxy: str = option(
+        help="a run directory, a safetensors file, a shipped name (cartpole), or real"
+    )
+    env: str | None = option(
+        None, names_code=True, help="the task, where proxy=real or the proxy's is your own"
+    )
+    proxy_kind: str | None = option(
+        None, names_code=True, help="my_module:MyProxy, where the proxy is of a kind of your own"
+    )
+    agent_hparams: str = option(
+        "default",
+        one_of(EVALUATION_HPARAMS),
+        help=(
+            "as_learned: agents and exploration that the proxy was learned with, where no agent "
+            "is named; default: the agent's; varied: drawn around them for each agent."
+        ),
+    )
+    training_from: str = option(
+        "proxy",
+        one_of(TRAINING_FROM),
+        help=(
+            "How long agents train on the proxy. proxy: on an SE as it was learned with, on a "
+            "reward network as on the real task (as_learned: with the time limit as in its run); "
+            "config: as `training` says."
+        ),
+    )
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
-    baseline: bool = True  # as many agents trained on the real task, beside them
-    out_dir: str | None = None  # null: beside the proxy (runs/evaluate-<name> without a folder)
-    # On the real task, and how all agents are tested unless training_from=config.
-    real_training: TrainingConfig = REAL_TRAINING
+    baseline: bool = option(True, help="as many agents trained on the real task, beside them")
+    out_dir: str | None = option(
+        None, help="null: beside the proxy (runs/evaluate-<name> without a folder)"
+    )
+    real_training: TrainingConfig = option(
+        REAL_TRAINING,
+        help="On the real task, and how all agents are tested unless training_from=config.",
+    )
 
     @staticmethod
-    def spec_for(given: Mapping[str, Any]) -> TaskSpec:
-        """The task of a stored proxy, or of overrides; nothing that a file names is imported."""
-        from sejax.proxies import header  # which reads files, and hubs
-
-        source = str(given.get("proxy", ""))
-        if source in ("", "real"):
-            return CommandConfig.spec_for(given)
+    def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:
+        """The task of a stored proxy, or of words; nothing that a file names is imported."""
+        source = str(given.get("proxy", "real"))
+        if source == "real":
+            return CommandConfig.spec_for(given, imports)
         return header.read(source, "proxy").header.spec
 
     def __post_init__(self) -> None:
@@ -318,29 +312,33 @@ class EvaluateConfig(CommandConfig):
         )
 
 
-def learn_config(values: Mapping[str, Any]) -> LearnConfig:
+def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()) -> LearnConfig:
     """The configuration of a run from plain values, as `config.yaml` and proxy files hold them.
+
+    Args:
+      values: nested plain values. One agent may stand as `agent`.
+      imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
     # A stored proxy does not say who followed its run, or where it was computed.
     unsaid = {"tracker": {"name": "none"}, "machines": {"name": "local"}}
-    return _from_plain(LearnConfig, unsaid | dict(values))
+    return _from_plain(LearnConfig, unsaid | dict(values), imports)
 
 
 def plain(config: CommandConfig) -> dict[str, Any]:
     """A command's configuration as plain values; inverse of `learn_config`."""
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     for group in config.groups:
-        if values[group] is not None:
-            values[group] = registry.describe(group, values[group])
-    if config.agents is not None:
-        values["agents"] = {name: getattr(config.agents, name) for name in _SHARED} | {
-            each.key: {"name": "", "weight": each.weight} | registry.describe("agent", each.agent)
-            for each in config.agents.members
-        }
-    return to_plain(values)  # type: ignore[no-any-return]
+        values[group] = registry.describe(group, values[group])
+    of_agents = {key: registry.describe("agent", x) for key, x in config.agents.items()}
+    mixture, weights = values.pop("mixture", None), values.pop("weights", ())
+    if len(of_agents) > 1 and mixture is not None:
+        for one, weight in zip(of_agents.values(), weights, strict=True):
+            one["weight"] = weight
+        of_agents |= to_plain(mixture)
+    return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
 
 
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
@@ -349,30 +347,49 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     New fields have a default that changes no number. Of `module:attribute` only what `config` has
     is imported.
     """
-    own = map(as_text, flatten(plain(config)).values())
     try:
-        with registry.only_typed(own):
-            return plain(learn_config(stored))
+        return plain(learn_config(stored, {*map(str, flatten(plain(config)).values())}))
     except ConfigError:
         return dict(stored)
 
 
-def _from_plain(schema: type[Schema], values: Mapping[str, Any]) -> Schema:
-    typed = dict(values)
-    typed["agents"] = mixture = _agents_from_plain(values.get("agents"))
-    agent = values.get("agent")
+def _from_plain(
+    schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
+) -> Schema:
+    objects = dict(values)
+    one, several = objects.pop("agent", None), objects.pop("agents", None)
     require(
-        mixture is None or agent is None,
+        one is None or several is None,
         "agent",
-        f"must be left out with agents; got {shortened(agent)}. Set agents=[...] alone.",
+        f"must be left out with agents; got {shortened(one)}. Set agents=[...] alone.",
     )
+    if isinstance(one, Mapping):
+        several = {key_of(str(one.get("name"))): one}
+    require(
+        isinstance(several, Mapping),
+        "agents",
+        f"must be agents by their keys; got {shortened(several or one)}. Set agents=[ddqn,ppo].",
+    )
+    of_agents = {str(key): x for key, x in several.items()}
+    shared = {name: of_agents.pop(name) for name in fields_of(MixtureConfig) if name in of_agents}
+    require(of_agents, "agents", "must hold an agent; got none. Set agents=[ddqn,ppo].")
+    objects["agents"], weights = {}, []
+    for key in sorted(of_agents):
+        where, fields = field_of(key, of_agents), of_agents[key]
+        is_word = key == key_of(key)
+        require(is_word, where, f"must be a word; got {shortened(key)}. Set agents=[ddqn,ppo].")
+        fields = dict(fields) if isinstance(fields, Mapping) else {}
+        share = {"weight": fields.pop("weight")} if "weight" in fields else {}
+        weights.append(from_plain(Share, share, where).weight)
+        objects["agents"][key] = registry.configure("agent", fields, imports, where)
+    if schema.learns:
+        objects["weights"] = weights
+        objects["mixture"] = from_plain(MixtureConfig, shared, "agents")
     for group in schema.groups:
-        if group == "agent" and mixture is not None:
-            continue
-        is_chosen = typed.get(group) is not None
+        is_chosen = objects.get(group) is not None
         require(is_chosen, group, f"must be chosen; got none. Set {group}=NAME.")
-        typed[group] = registry.configure(group, typed[group])
-    return from_plain(schema, typed, "")
+        objects[group] = registry.configure(group, objects[group], imports)
+    return from_plain(schema, objects, "", imports)
 
 
 def require_real_returns(name: str, training: TrainingConfig) -> None:
@@ -412,11 +429,11 @@ def require_learning(
     )
 
 
-# --- overrides -----------------------------------------------------------------------------------
+# --- words ---------------------------------------------------------------------------------------
 
 
 def config(overrides: Sequence[str] = ()) -> LearnConfig:
-    """Composes and validates a configuration from command-line overrides.
+    """Composes and validates a configuration from the words of the command line.
 
     Args:
       overrides: as typed after `python -m sejax.run`.
@@ -428,42 +445,49 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
+    composed = composed_run(overrides)
+    return learn_config(composed.values, composed.imports)
+
+
+def composed_run(overrides: Sequence[str]) -> Composed:
+    """What the words of `sejax.run` compose."""
     _require_overrides(overrides)
-    with registry.only_typed(overrides):
-        return learn_config(compose(LearnConfig, overrides).values)
+    return compose(LearnConfig, overrides)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
-    """As `config`, for the overrides after `python -m sejax.evaluate`."""
+    """As `config`, for the words after `python -m sejax.evaluate`."""
+    composed = composed_evaluation(overrides)
+    require(
+        "proxy" in composed.values,
+        "proxy",
+        "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
+        "proxy=real env=cartpole.",
+    )
+    return _from_plain(EvaluateConfig, composed.values, composed.imports)
+
+
+def composed_evaluation(overrides: Sequence[str]) -> Composed:
+    """What the words of `sejax.evaluate` compose, over what the proxy was learned with."""
     _require_overrides(overrides)
-    with registry.only_typed(overrides):
-        composed = compose(EvaluateConfig, with_learned(overrides))
-        require(
-            "proxy" in composed.values,
-            "proxy",
-            "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
-            "proxy=real env=cartpole.",
-        )
-        return _from_plain(EvaluateConfig, composed.values)
+    return compose(EvaluateConfig, overrides, _learned(read(overrides)))
 
 
-def with_learned(overrides: Sequence[str]) -> list[str]:
-    """Overrides that say which agents a stored proxy was learned with, then those of an evaluation.
+def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a proxy was learned with, as far as the agents of an evaluation have it.
 
-    Where these name no agent, they are all of the proxy's, with their exploration. An agent that
-    they name has the hyperparameters that the proxy was learned with, if it was with such a one.
+    Where its words name no agent, they are all of the proxy's, with their exploration. An agent
+    that they name has the hyperparameters that the proxy was learned with, if it was with such a
+    one.
 
     Raises:
       ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
         tell its agents.
     """
-    from sejax.proxies import header  # which reads files, and hubs
-
-    given = read(overrides)
     source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
     if source == "real" or hparams not in (None, "as_learned"):
-        return [*overrides]
-    groups = ("agents", *EvaluateConfig.groups)
+        return {}
+    groups = ("agent", "agents", *EvaluateConfig.groups)
     own = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
     require(
         not own or hparams is None,
@@ -471,37 +495,26 @@ def with_learned(overrides: Sequence[str]) -> list[str]:
         "must be left out with agent_hparams=as_learned; got "
         f"{shortened(', '.join(f'{k}={x}' for k, x in own.items()))}. Set agent_hparams=default.",
     )
+    none = {"name": "none"}
     try:
         path = header.find(source, "proxy")
         stored = header.read_config(path, "proxy")
         learned = {
-            key: registry.describe("agent", header.configured("agent", values, path.name))
-            for key, values in header.agents_of(stored).items()
+            key_of(key): registry.describe("agent", header.configured("agent", x, path.name))
+            for key, x in header.agents_of(stored).items()
         }
-        explored = header.configured(
-            "exploration", stored.get("exploration", {"name": "none"}), path.name
-        )
+        explored = header.configured("exploration", stored.get("exploration", none), path.name)
     except ConfigError:  # of the proxy, which is said when it is loaded
         if hparams == "as_learned":
             raise
-        return [*overrides]
-    if own:
-        by_name = {values["name"]: values for values in learned.values()}
-        named = {f"agents.{key}": name for key, name in mixture_of(given).items()}
-        if not named:
-            default = agents.default_for(EvaluateConfig.spec_for(given))
-            named = {"agent": given.get("agent", default)}
-        fields = flatten({field: by_name.get(name, {}) for field, name in named.items()})
-        fields.pop("agent.name", None)
-    else:
-        parts = {"exploration": registry.describe("exploration", explored)}
-        parts |= {"agent": next(iter(learned.values()))} if len(learned) == 1 else {}
-        fields = {group: values.pop("name") for group, values in parts.items()}
-        fields |= flatten(parts) | {"agent_hparams": "as_learned"}
-        if len(learned) > 1:
-            fields |= {"agents": list(learned)} | flatten({"agents": learned})
-    words = [f"{name}={as_text(x)}" for name, x in fields.items() if name not in given]
-    return [*words, *overrides]
+        return {}
+    if not own:
+        explored = registry.describe("exploration", explored)
+        return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
+    by_name = {values["name"]: values for values in learned.values()}
+    default = agents.default_for(EvaluateConfig.spec_for(given))
+    keys = agents_of(given) or {default: default}
+    return {"agents": {key: by_name.get(name, {"name": name}) for key, name in keys.items()}}
 
 
 def _require_overrides(overrides: object) -> None:

@@ -73,13 +73,14 @@ def objective_of(preset: str, env: str, proxy: str) -> str | None:
     return found
 
 
-def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]) -> dict[str, Any]:
+def values_of(preset: str, chosen: Mapping[str, str], agents: Mapping[str, str]) -> dict[str, Any]:
     """The settings of a preset for these choices, nested plain values.
 
     Args:
       preset: its name.
       chosen: the choice of each group.
-      mixture: names of a mixture's agents by their keys.
+      agents: names of the agents by their keys. What a preset says of other groups beside an agent
+        holds where that is the only one.
 
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
@@ -96,15 +97,15 @@ def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]
         "Set preset=best.",
     )
     section = sections[preset]
-    of_choices = ("objective",)  # which `objective_of` has told
-    values: dict[str, Any] = {
-        k: v for k, v in section.items() if not k.startswith("with_") and k not in of_choices
-    }
-    for group in ("es", "objective", "agent"):
-        values = merge(values, section.get(f"with_{group}", {}).get(chosen.get(group), {}))
+    values = {k: x for k, x in section.items() if not k.startswith("with_") and k != "objective"}
     with_agent = section.get("with_agent", {})
-    each = {key: with_agent.get(name, {}).get("agent", {}) for key, name in mixture.items()}
-    return {"preset": preset} | values | ({"agents": each} if each else {})
+    settings = {key: with_agent.get(name, {}) for key, name in agents.items()}
+    layers = [section.get(f"with_{x}", {}).get(chosen[x], {}) for x in ("es", "objective")]
+    layers += settings.values() if len(agents) == 1 else []
+    values = merge(values, *layers)
+    values.pop("agent", None)
+    own = {key: each.get("agent", {}) for key, each in settings.items()}
+    return {"preset": preset} | values | {"agents": own}
 
 
 def read_file(path: Path) -> dict[str, Any]:
@@ -137,9 +138,9 @@ def read_file(path: Path) -> dict[str, Any]:
         f"must name no file in a file; got {shortened(base)}. Write preset: best.",
     )
     chosen = {x.removesuffix(".name"): values.pop(x) for x in [*values] if x.endswith(".name")}
-    mixture = [x.removeprefix("agents.") for x in chosen if x.startswith("agents.")]
-    names = {f"agents.{key}.name": chosen.pop(f"agents.{key}") for key in mixture}
-    values |= chosen | names | ({"agents": mixture} if mixture else {})
+    keys = [x.removeprefix("agents.") for x in chosen if x.startswith("agents.")]
+    names = {f"agents.{key}.name": chosen.pop(f"agents.{key}") for key in keys}
+    values |= chosen | names | ({"agents": keys} if keys else {})
     return {k: v for k, v in values.items() if v is not None or k not in ("agent", "agents")}
 
 

@@ -21,7 +21,7 @@ from sejax.bilevel import Bilevel, make_bilevel
 from sejax.options import Options, marks, traced_options
 from sejax.options.plain import to_plain
 from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig, members_of
+from sejax.runs.config import LearnConfig
 from sejax.runs.session import Chunks
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
@@ -81,7 +81,7 @@ def shape_of(config: LearnConfig, numbers: dict[str, Any]) -> str:
     plain["es"] = _without(plain["es"], numbers["es"])
     if numbers["agents"]:
         learners = Mixture.of(config.parts()["agent"])
-        plain["agent"] = [static_of(member.agent) for member in members_of(config)]
+        plain["agent"] = [static_of(agent) for agent in config.agents.values()]
         shared = {
             f.name: getattr(learners.config, f.name) for f in dataclasses.fields(MixtureConfig)
         }

@@ -16,7 +16,7 @@ from rich.progress import (
 
 from sejax.options import registry
 from sejax.runs import next_steps, preset_files
-from sejax.runs.config import LearnConfig, members_of
+from sejax.runs.config import LearnConfig
 from sejax.runs.trackers import FinishedGeneration, Reporter
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
@@ -158,7 +158,7 @@ class RunProgress(Reporter):
                 f"{solved}: best incumbent mean {best:.1f}, solved at {learner.solved_score:g}"
             )
         path, config = directory.path, self._config
-        agents = [registry.name_of("agent", each.agent) for each in members_of(config)]
+        agents = [registry.name_of("agent", each) for each in config.agents.values()]
         words = next_steps.evaluate_words(path, config.name("env"), config.name("proxy"), agents)
         self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(

@@ -58,12 +58,21 @@ class RayConfig(Options):
     is_elsewhere: ClassVar[bool] = True
     package: ClassVar[str] = "ray"
 
-    # HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or local
-    address: str | None = None
-    # worker processes; null: one for each CPU core of the cluster, or for each GPU
-    workers: int | None = option(None, counts("somebody must compute"))
-    # 0: a worker computes on a CPU core; 0.5: two workers share a GPU
-    gpus_per_worker: float = option(0.0, fraction())
+    address: str | None = option(
+        None,
+        help=(
+            "HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or "
+            "local"
+        ),
+    )
+    workers: int | None = option(
+        None,
+        counts("somebody must compute"),
+        help="worker processes; null: one for each CPU core of the cluster, or for each GPU",
+    )
+    gpus_per_worker: float = option(
+        0.0, fraction(), help="0: a worker computes on a CPU core; 0.5: two workers share a GPU"
+    )
 
     def make(
         self, config: "LearnConfig", say: Callable[[str], None]
@@ -312,7 +321,7 @@ class Worker:
         from sejax.bilevel import make_bilevel
         from sejax.runs import config as configuration
 
-        of_run = configuration.learn_config(config)
+        of_run = configuration.learn_config(config, imports=None)
         learner = make_bilevel(**of_run.parts() | {"devices": 1})
         self._capacities = capacities
         self._programs = [

@@ -13,8 +13,8 @@ from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, ProxySet, load_proxy
 from sejax.runs import config as configuration
-from sejax.runs.compose import named
-from sejax.runs.config import EvaluateConfig, MixtureMember, members_of
+from sejax.runs.compose import errors_of
+from sejax.runs.config import EvaluateConfig
 from sejax.training import TrainingConfig, require_reachable, training_of
 
 Loaded = TypeVar("Loaded", Proxy, ProxySet)
@@ -35,37 +35,36 @@ class Setup:
     Attributes:
       task: the real task, on which all are tested.
       worlds: by name, the first one first in tables.
-      members: the agents.
+      agents: by their keys.
       exploration: of all of them.
       out_dir: where the files go.
     """
 
     task: envs.Task
     worlds: dict[str, World]
-    members: tuple[MixtureMember, ...]
+    agents: dict[str, AgentConfig]
     exploration: Any
     out_dir: Path
 
     @property
     def has_several(self) -> bool:
-        return len(self.members) > 1
+        return len(self.agents) > 1
 
 
 def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
     require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
     task_config = registry.configure("env", {"name": config.env})
-    members = members_of(config)
-    for member in members:
-        with named(member.field):
+    for key, agent in config.agents.items():
+        with errors_of("agent", config.field_of(key)):
             spec = envs.spec_of(task_config)
-            agents.require_fit(member.agent, config.exploration, spec, str(config.env))
+            agents.require_fit(agent, config.exploration, spec, str(config.env))
     task = envs.make_from(task_config)
-    trainings = dict.fromkeys((member.key for member in members), config.real_training)
+    trainings = dict.fromkeys(config.agents, config.real_training)
     return Setup(
         task=task,
         worlds={"the real task": World(task.env, task.params, trainings)},
-        members=members,
+        agents=config.agents,
         exploration=config.exploration,
         out_dir=Path(config.out_dir or Path("runs", f"evaluate-{as_file_name(task.name)}")),
     )
@@ -75,12 +74,10 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     """Agents on a proxy, and on its real task beside them."""
     proxy = load(config, load_proxy)
     env, task = proxy.env, proxy.task
-    members, exploration = members_of(config), config.exploration
     trainings = {}
-    for member in members:
-        agent = member.agent
-        with named(member.field):
-            agents.require_fit(agent, exploration, task, task.name)
+    for key, agent in config.agents.items():
+        with errors_of("agent", config.field_of(key)):
+            agents.require_fit(agent, config.exploration, task, task.name)
             group, training = _training_on(proxy, config, agent)
             configuration.require_real_returns(group, training)
             require_reachable(group, training, env.max_steps)
@@ -88,7 +85,7 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
                 configuration.require_learning(
                     group, training, agent, env.max_steps, task.max_steps
                 )
-        trainings[member.key] = training
+        trainings[key] = training
     worlds = {"the proxy": World(env, proxy.params, trainings)}
     if config.baseline:
         real_trainings = dict.fromkeys(trainings, _real_training(config, proxy))
@@ -101,8 +98,8 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     return Setup(
         task=task,
         worlds=worlds,
-        members=members,
-        exploration=exploration,
+        agents=config.agents,
+        exploration=config.exploration,
         out_dir=Path(config.out_dir or beside),
     )
 

@@ -64,35 +64,61 @@ class SearchConfig(Options):
 
     group: ClassVar[str] = ""
 
-    # trials that end, pruned or complete
-    trials: int = option(60, counts("there is nothing to compare otherwise"))
-    sampler: str = option("tpe", one_of(SAMPLERS))  # tpe or random
-    # null: drawn, so that workers do not draw alike
-    sampler_seed: int | None = option(None, counts("it seeds a generator", least=0))
-    pruner: str = option("hyperband", one_of(PRUNERS))  # hyperband, median or none
-    # before a trial may be pruned
-    min_generations: int = option(3, counts("a trial must show something"))
-    # of a trial that is not pruned
-    max_generations: int = option(27, counts("there is nothing to do otherwise"))
-    seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial
-    score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds: mean or worst
-    # The score of a seed. last: of its last generation; best: its best so far; mean: the mean of
-    # all so far, which rewards learning early. null: last for a proxy, mean for an agent
-    measure: str | None = option(None, one_of(MEASURES))
-    space: str | None = None  # a preset of ranges, or FILE.yaml
-    study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
-    storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
-    search_dir: str | None = None  # null: runs/search-<study>
-    # s, after which no trial is begun
-    timeout: float | None = option(None, positive("no trial would start"))
+    trials: int = option(
+        60,
+        counts("there is nothing to compare otherwise"),
+        help="trials that end, pruned or complete",
+    )
+    sampler: str = option("tpe", one_of(SAMPLERS), help="tpe or random")
+    sampler_seed: int | None = option(
+        None,
+        counts("it seeds a generator", least=0),
+        help="null: drawn, so that workers do not draw alike",
+    )
+    pruner: str = option("hyperband", one_of(PRUNERS), help="hyperband, median or none")
+    min_generations: int = option(
+        3, counts("a trial must show something"), help="before a trial may be pruned"
+    )
+    max_generations: int = option(
+        27, counts("there is nothing to do otherwise"), help="of a trial that is not pruned"
+    )
+    seeds: int = option(1, counts("a trial needs a run"), help="runs of a trial")
+    score: str = option("mean", one_of(SCORES), help="of a trial, over its seeds: mean or worst")
+    measure: str | None = option(
+        None,
+        one_of(MEASURES),
+        help=(
+            "The score of a seed. last: of its last generation; best: its best so far; mean: the "
+            "mean of all so far, which rewards learning early. null: last for a proxy, mean for "
+            "an agent"
+        ),
+    )
+    space: str | None = option(None, help="a preset of ranges, or FILE.yaml")
+    study: str | None = option(None, help="null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>")
+    storage: str | None = option(None, help="null: SQLite in search_dir; any URL that Optuna takes")
+    search_dir: str | None = option(None, help="null: runs/search-<study>")
+    timeout: float | None = option(
+        None, positive("no trial would start"), help="s, after which no trial is begun"
+    )
     heartbeat: int = option(
-        15, counts("workers must show that they live")
-    )  # seconds between signs of life of a worker
-    # The best trials that are tried again, as the best score of many is the luckiest too: on the
-    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5)
-    verify: int | None = option(None, counts("the best are tried again", least=0))
-    # new seeds of each that is tried again
-    fresh_seeds: int = option(5, counts("the best are tried again with them"))
+        15,
+        counts("workers must show that they live"),
+        help="seconds between signs of life of a worker",
+    )
+    verify: int | None = option(
+        None,
+        counts("the best are tried again", least=0),
+        help=(
+            "The best trials that are tried again, as the best score of many is the luckiest too:"
+            " on the real task after a search on a proxy (null: 10), else with seeds that are new"
+            " (null: 5)"
+        ),
+    )
+    fresh_seeds: int = option(
+        5,
+        counts("the best are tried again with them"),
+        help="new seeds of each that is tried again",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -157,7 +183,7 @@ class Search:
         choices = [x for x in self.fixed if "." not in x.partition("=")[0]]
         if self.is_of_agent and not given:
             config = configuration.evaluate_config([*choices, DEFAULT])
-            return registry.name_of("agent", config.agent)
+            return configuration.JOINT.join(config.agents)
         return given or configuration.config(choices).name("agent")
 
     @functools.cached_property
@@ -255,6 +281,7 @@ def read(overrides: Sequence[str]) -> Search:
             space[name] = spaces.parse(name, text)
         else:
             fixed.append(f"{name}={text}")
+    _require_typed("preset", fixed, overrides)
     config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
@@ -270,14 +297,20 @@ def read(overrides: Sequence[str]) -> Search:
     given = {override.partition("=")[0] for override in fixed} | set(space)
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     offered = {name: x for name, x in preset.items() if name not in given}
-    foreign = registry.untyped(x.text for x in offered.values())
+    _require_typed("space", [x.text for x in offered.values()], overrides)
+    return dataclasses.replace(search, space={**offered, **space})
+
+
+def _require_typed(field: str, texts: Sequence[str], overrides: Sequence[str]) -> None:
+    """Checks that a file names no module that the user has not typed."""
+    typed = registry.paths_in(overrides)
+    foreign = [path for path in registry.paths_in(texts) if path not in typed]
     require(
         not foreign,
-        "space",
-        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Set "
-        "agent='choice(...)' on the command line.",
+        field,
+        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Type "
+        "it on the command line too.",
     )
-    return dataclasses.replace(search, space={**offered, **space})
 
 
 def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict[str, object]:

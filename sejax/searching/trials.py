@@ -200,7 +200,7 @@ class Tuning:
         """See `Runner`; also refused are agents that would not learn on the proxy."""
         config = configuration.evaluate_config([DEFAULT, *self._search.fixed, *overrides])
         require(
-            config.agents is None,
+            len(config.agents) == 1,
             "agent",
             "must be one where its settings are searched; got several. Set agent=ppo.",
         )
@@ -273,10 +273,10 @@ class Tuning:
     ) -> Outcome:
         """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
         setup = proxy_setup(config)
-        (member,) = setup.members
-        agent = make_agent(member.agent, setup.task, setup.exploration)
+        ((key, agent_config),) = setup.agents.items()
+        agent = make_agent(agent_config, setup.task, setup.exploration)
         env, env_params, trainings = setup.worlds[world]
-        training = trainings[member.key]
+        training = trainings[key]
 
         def one(key: Array, hparams: Any) -> Outcome:
             tried = dataclasses.replace(agent, hparams=hparams)
@@ -295,7 +295,7 @@ class Tuning:
         key = json.dumps(
             [
                 world,
-                static_of(member.agent),
+                static_of(agent_config),
                 static_of(setup.exploration),
                 to_plain(training),
                 structure_of(agent.hparams),

@@ -9,7 +9,7 @@ from typing import Any
 
 import optuna
 
-from sejax.options import FailedError, registry
+from sejax.options import FailedError
 from sejax.runs import cluster, runtime
 from sejax.runs.workers import RayConfig
 from sejax.searching import config as search_config
@@ -70,6 +70,5 @@ def _work(overrides: Sequence[str], gpu: float) -> None:
     runtime.configure_xla(1)
     runtime.take_share_of_gpu(gpu)
     runtime.configure_jax()
-    with registry.only_typed(overrides):
-        search = search_config.read(overrides)
-        take_trials(open_study(search), search, runner_of(search), lambda text: None)
+    search = search_config.read(overrides)
+    take_trials(open_study(search), search, runner_of(search), lambda text: None)

@@ -105,7 +105,7 @@ class HalfCheetah(MujocoTask):
         augmented_keys=_ON_A_LINE,
     )
 
-    backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
+    backend: str = option(BACKENDS[0], one_of(BACKENDS), help="physics")
 
     def make(self) -> Task:
         if self.backend == BACKENDS[0]:
@@ -193,7 +193,7 @@ class Ant(Runner):
     contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
-    include_cfrc_ext_in_observation: bool = True  # external forces on each body
+    include_cfrc_ext_in_observation: bool = option(True, help="external forces on each body")
 
     @property
     def spec(self) -> TaskSpec:
