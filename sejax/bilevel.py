@@ -21,21 +21,17 @@ from jaxtyping import Array, Float, PyTree
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
-from sejax.es.base import Strategy, StrategyState
+from sejax.es.base import Groups, Strategy, StrategyState
 from sejax.es.nes import NESConfig
-from sejax.evaluation import (
-    Candidates,
-    Evaluator,
-    evaluators_of,
-    make_population_evaluator,
-    tested_throughout,
-)
-from sejax.objectives import GenerationInfo, MaxReward, Objective, Outcome, Scoring
+from sejax.evaluation import tested_throughout
+from sejax.generation import Candidates, GenerationEvaluator
+from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
 from sejax.options import counts, registry, require, shortened
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.configs import SyntheticConfig
+from sejax.scoring import GenerationInfo, Scoring
 from sejax.training import TrainingConfig
 
 T = TypeVar("T")
@@ -79,10 +75,8 @@ class Bilevel:
     strategy: Strategy
     objective: Objective
     scoring: Scoring  # how outcomes become scores
-    evaluators: tuple[Evaluator, ...]  # of one candidate
-    evaluate: Callable[[Candidates], Outcome]  # trains and tests; leaves [evaluation, ...]
+    evaluate: GenerationEvaluator  # trains and tests
     unravel: Callable[[Array], PyTree]  # a flat vector [dims] to the proxy's weights
-    params_of: Callable[[Array], PyTree]  # the same to its `EnvParams`
     num_dims: int
     stop_when_solved: bool
     devices: int | None
@@ -124,26 +118,23 @@ class Bilevel:
         return self.tell(state, candidates, self.evaluate(candidates))
 
     def ask(self, state: LearnState) -> Candidates:
-        """The population around the incumbent, and a key for each evaluation."""
+        """The population around the incumbent, and a key for each of their trainings."""
         key = jax.random.fold_in(state.key, state.generation)
         key_ask, key_inner, key_tell = jax.random.split(key, 3)
         population, es_state = self.strategy.ask(key_ask, state.es_state)
-        incumbent = self.strategy.incumbent(es_state)
-        evaluations, eval_steps = self.strategy.evaluations, self.objective.eval_steps
-        seed_ids = jnp.asarray(evaluations.seed_ids(self.strategy.population_size))
+        test_params = self.objective.test_params
         return Candidates(
             population=population,
-            incumbent=incumbent,
-            params=evaluations.params(population, incumbent),
-            keys=jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids),
+            incumbent=self.strategy.incumbent(es_state),
+            keys=self.strategy.evaluations.keys(key_inner, len(population), self.mixture.size),
             active=~state.solved,
-            eval_steps=None if eval_steps is None else eval_steps(state.generation),
+            test_params=None if test_params is None else test_params(state.generation),
             key_tell=key_tell,
             es_state=es_state,
         )
 
     def tell(
-        self, state: LearnState, candidates: Candidates, outcome: Outcome
+        self, state: LearnState, candidates: Candidates, outcomes: Groups[Outcome]
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
@@ -151,12 +142,12 @@ class Bilevel:
         comparison, the search goes on to weights that teach under perturbation too.
         """
         # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
-        outcome = jax.lax.optimization_barrier(outcome)
-        compared = self.scoring.for_strategy(outcome)
+        outcomes = jax.lax.optimization_barrier(outcomes)
+        compared = self.scoring.for_strategy(outcomes)
         es_state = self.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        scores = self.scoring.judged(outcome)
+        scores = self.scoring.judged(outcomes)
         score, by_agent = _or_lowest(scores.incumbent_mean), _or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = state.replace(
@@ -172,8 +163,10 @@ class Bilevel:
             solved=state.solved | self.is_solved(score),
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
-        active = ~state.solved
-        return after, self.scoring.info(scores, outcome, state.generation, after.best_score, active)
+        info = self.scoring.info(
+            scores, outcomes, state.generation, after.best_score, active=~state.solved
+        )
+        return after, info
 
 
 @runtime_checkable
@@ -276,12 +269,7 @@ def make_bilevel(
     mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     training = tested_throughout(training) if objective.needs_tests else training
-    evaluators = evaluators_of(mixture, proxy, training)
     scoring = Scoring.of(objective, strategy, mixture)
-
-    def params_of(vector: Array) -> PyTree:
-        return proxy.params(unravel(vector))
-
     bilevel = Bilevel(
         proxy=proxy,
         mixture=mixture,
@@ -289,12 +277,8 @@ def make_bilevel(
         strategy=dataclasses.replace(strategy, evaluations=scoring.evaluations),
         objective=objective,
         scoring=scoring,
-        evaluators=evaluators,
-        evaluate=make_population_evaluator(
-            evaluators, params_of, scoring.agent_of_evaluation, devices, num_parallel
-        ),
+        evaluate=GenerationEvaluator(proxy, unravel, training, scoring, devices, num_parallel),
         unravel=unravel,
-        params_of=params_of,
         num_dims=num_dims,
         stop_when_solved=stop_when_solved,
         devices=devices,

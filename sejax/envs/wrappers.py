@@ -1,11 +1,13 @@
-"""Environments around another one: each action repeated, or everything as vectors."""
+"""Environments around another one: actions repeated, partly scored, or all as vectors."""
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Float, PyTree
 
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step, spaces_of
@@ -101,6 +103,60 @@ def _select(condition: Array, a: PyTree, b: PyTree) -> PyTree:
 def repeat_actions(env: Environment, num_repeats: int) -> Environment:
     """The environment in which actions last for `num_repeats` steps; itself for 1."""
     return env if num_repeats == 1 else ActionRepeat(env, num_repeats)
+
+
+@struct.dataclass
+class PartState(EnvState):
+    world: EnvState  # the wrapped environment's
+
+
+@struct.dataclass
+class PartParams(EnvParams):
+    scored_steps: Array | int = 1  # may exceed the task's step limit
+
+
+class PartlyScored(Wrapper):
+    """An environment of which the first steps of an episode are scored, or more than all.
+
+    Rewards are those within the task's step limit, where a repeated action ends too;
+    `info["scored_reward"]` is the reward of a decision that begins within the scored steps, and 0
+    after them. An episode lasts to the later of both limits.
+
+    Args:
+      env: the environment.
+      params: its own; those of this one are `PartParams`.
+    """
+
+    def __init__(self, env: Environment, params: EnvParams):
+        super().__init__(env)
+        self.params = params
+
+    def reset_env(self, key: Array, params: PartParams) -> tuple[Array, PartState]:
+        obs, world = self.env.reset_env(key, self.params)
+        return obs, PartState(time=jnp.int32(0), world=world)
+
+    def step_env(
+        self, key: Array, state: PartState, action: Array, params: PartParams
+    ) -> Step[PartState]:
+        limit = self.params.max_steps_in_episode
+        is_within = state.time < limit
+        until = jnp.where(is_within, limit, self._longest(params))
+        obs, world, reward, terminated, info = self.env.step_env(
+            key, state.world, action, self._with_limit(until)
+        )
+        scored = jnp.where(state.time < params.scored_steps, reward, 0.0)
+        state = PartState(time=state.time + info.get("num_steps", 1), world=world)
+        reward = jnp.where(is_within, reward, 0.0)
+        return obs, state, reward, terminated, {**info, "scored_reward": scored}
+
+    def is_truncated(self, state: PartState, params: PartParams) -> Array:
+        return self.env.is_truncated(state.world, self._with_limit(self._longest(params)))
+
+    def _longest(self, params: PartParams) -> Array:
+        return jnp.maximum(self.params.max_steps_in_episode, params.scored_steps)
+
+    def _with_limit(self, steps: Array) -> EnvParams:
+        return dataclasses.replace(self.params, max_steps_in_episode=steps)
 
 
 class AsVectors(Wrapper):

@@ -16,13 +16,13 @@ import numpy as np
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.objectives import GenerationInfo
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 from sejax.runs import next_steps, plots, runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
 PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
