@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, PyTree
 
 from sejax.es.base import Groups, StrategyState
-from sejax.evaluation import make_evaluator, num_parallel_on_cpu
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
 from sejax.objectives import Outcome
 from sejax.ops.parallel import spread_groups_over_devices
 from sejax.proxies.base import ProxyEnv
@@ -59,6 +59,7 @@ class GenerationEvaluator:
       num_parallel: None for what suits each agent.
 
     Attributes:
+      devices: as given.
       runs: of each agent, `(training) -> Outcome` for one of its `Trainings`.
       widths: of each agent, trainings in a vmapped batch on a CPU core; None for all.
       sizes: of each agent, trainings in a generation.
@@ -76,9 +77,12 @@ class GenerationEvaluator:
         devices: int | None = None,
         num_parallel: int | None = None,
     ):
-        agents, test_env = scoring.mixture.agents, scoring.objective.test_env
+        self.devices = devices
+        agents, objective = scoring.mixture.agents, scoring.objective
+        training = tested_throughout(training) if objective.needs_tests else training
         evaluators = [
-            make_evaluator(agent, proxy, proxy.task, training, test_env) for agent in agents
+            make_evaluator(agent, proxy, proxy.task, training, objective.test_env)
+            for agent in agents
         ]
 
         def run_with(evaluate: Callable[..., Outcome]) -> Callable[[Trainings], Outcome]:

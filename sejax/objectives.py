@@ -61,11 +61,11 @@ class Objective:
         each of them, and none stops because it has solved the task.
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
-      shown: the score that people see and that selects the best proxy, likewise; `score` if None.
+      shown: the score that people see and that selects the best proxy, likewise; None where it is
+        `score`, which otherwise compares candidates within a generation alone.
       test_env: what test episodes are played in, given the real task's environment; by default that
         itself. The `info["scored_reward"]` of its steps adds up to `Outcome.scored_returns`.
-      test_params: `generation -> EnvParams` of `test_env`. With them the unit of scores may differ
-        between generations.
+      test_params: `generation -> EnvParams` of `test_env`; None for the task's.
       meaning: of a score, for people.
     """
 
@@ -74,7 +74,7 @@ class Objective:
     scores_are_returns: bool = False
     shown: Callable[[Outcome], Float[Array, "*agent"]] | None = None
     test_env: Callable[[Environment], Environment] = lambda env: env
-    test_params: Callable[[Array], PyTree] | None = None
+    test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:

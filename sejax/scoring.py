@@ -95,7 +95,7 @@ class Scoring:
           ConfigError: if the population is too small for the mixture, or the strategy compares
             scores of several generations where their units differ.
         """
-        has_one_unit = mixture.size == 1 and objective.test_params is None
+        has_one_unit = mixture.size == 1 and objective.shown is None
         require(
             has_one_unit or not strategy.remembers_scores,
             "es",

@@ -19,3 +19,8 @@ def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
     """Mean of the finite scores; nan if there is none."""
     finite = jnp.isfinite(scores)
     return jnp.where(finite, scores, 0.0).sum() / finite.sum()
+
+
+def or_lowest(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Scores in which what is not finite is minus infinity."""
+    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
