@@ -42,12 +42,12 @@ _EXPORTS = {
     "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.io",
     "QLearningConfig": "sejax.agents.tabular",
-    "RewardConfig": "sejax.proxies.configs",
+    "RewardConfig": "sejax.proxies.reward",
     "RewardThreshold": "sejax.objectives",
     "SACConfig": "sejax.agents.sac",
     "SARSAConfig": "sejax.agents.tabular",
     "Strategy": "sejax.es.base",
-    "SyntheticConfig": "sejax.proxies.configs",
+    "SyntheticConfig": "sejax.proxies.synthetic",
     "TD3Config": "sejax.agents.td3",
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
@@ -69,7 +69,7 @@ _EXPORTS = {
     "save": "sejax.proxies.io",
     "save_set": "sejax.proxies.io",
     "spread_over_devices": "sejax.ops.parallel",
-    "training_of": "sejax.training",
+    "training_of": "sejax.proxies.io",
 }
 _MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
@@ -95,7 +95,6 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.options import ConfigError
     from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
-    from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.io import (
         Proxy,
         ProxySet,
@@ -106,11 +105,14 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         register_gymnax,
         save,
         save_set,
+        training_of,
     )
+    from sejax.proxies.reward import RewardConfig
+    from sejax.proxies.synthetic import SyntheticConfig
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
     from sejax.runs.config import config
     from sejax.runs.runtime import configure_xla
-    from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
+    from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 __all__ = [
     "AUC",

@@ -30,7 +30,7 @@ from sejax.ops.scores import or_lowest
 from sejax.options import counts, require
 from sejax.options.parts import Makes, RunConfig, made, require_part
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.scoring import GenerationInfo, Scoring
 from sejax.training import TrainingConfig
 

@@ -17,8 +17,7 @@ from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
-from sejax.proxies.configs import RewardConfig
-from sejax.proxies.reward import RewardEnv
+from sejax.proxies.reward import RewardConfig, RewardEnv
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 GAMMA = 0.9
