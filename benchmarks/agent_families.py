@@ -28,7 +28,7 @@ import common
 
 import sejax
 from sejax.options import registry
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.training import TrainingConfig
 
 WARM_UP_STEPS = 300

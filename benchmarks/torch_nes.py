@@ -19,7 +19,7 @@ from torch_reference import SyntheticEnv, Weights, play_test_episodes, train
 
 from sejax.agents.dqn import DDQNConfig
 from sejax.es.nes import NESConfig
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.training import TrainingConfig
 
 

@@ -36,7 +36,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from sejax.agents.dqn import DDQNConfig
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0

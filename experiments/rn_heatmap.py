@@ -35,7 +35,7 @@ CELLS = np.array([list(line) for line in MAP])  # [row, column]
 _COLORS = {"G": "#ffffff", "O": "#d9d9d9"}  # of cells without moves: goal and cliff
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
 # Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle
-# and two corners of the cell. Actions as in `envs.dynamics.gridworld`: RIGHT, LEFT, DOWN, UP.
+# and two corners of the cell. Actions as in `envs.gridworld`: RIGHT, LEFT, DOWN, UP.
 _CORNERS = {
     0: ((0.5, -0.5), (0.5, 0.5)),
     1: ((-0.5, -0.5), (-0.5, 0.5)),

@@ -39,7 +39,6 @@ from .ops.parallel import spread_over_devices as spread_over_devices
 from .options import ConfigError as ConfigError
 from .proxies import ProxyConfig as ProxyConfig
 from .proxies.base import ProxyEnv as ProxyEnv, ProxyParams as ProxyParams
-from .proxies.configs import RewardConfig as RewardConfig, SyntheticConfig as SyntheticConfig
 from .proxies.io import (
     Proxy as Proxy,
     ProxySet as ProxySet,
@@ -50,7 +49,10 @@ from .proxies.io import (
     register_gymnax as register_gymnax,
     save as save,
     save_set as save_set,
+    training_of as training_of,
 )
+from .proxies.reward import RewardConfig as RewardConfig
+from .proxies.synthetic import SyntheticConfig as SyntheticConfig
 from .proxies.zoo import PretrainedProxy as PretrainedProxy, pretrained as pretrained, push as push
 from .runs.config import config as config
 from .runs.runtime import configure_xla as configure_xla
@@ -58,7 +60,6 @@ from .training import (
     TrainingConfig as TrainingConfig,
     TrainResult as TrainResult,
     make_trainer as make_trainer,
-    training_of as training_of,
 )
 
 __version__: str

@@ -10,8 +10,7 @@ Source: paper, Algorithm 1.
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,24 +20,19 @@ from jaxtyping import Array, Float, PyTree
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
-from sejax.es.base import Strategy, StrategyState
+from sejax.es.base import Groups, Strategy, StrategyState
 from sejax.es.nes import NESConfig
-from sejax.evaluation import (
-    Candidates,
-    Evaluator,
-    evaluators_of,
-    make_population_evaluator,
-    tested_throughout,
-)
-from sejax.objectives import GenerationInfo, MaxReward, Objective, Outcome, Scoring
+from sejax.generation import Candidates, GenerationEvaluator
+from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
-from sejax.options import counts, registry, require, shortened
+from sejax.ops.scores import or_lowest
+from sejax.options import counts, require
+from sejax.options.parts import Makes, RunConfig, made, require_part
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
+from sejax.scoring import GenerationInfo, Scoring
 from sejax.training import TrainingConfig
-
-T = TypeVar("T")
 
 
 @struct.dataclass
@@ -69,30 +63,23 @@ class LearnResult:
     info: GenerationInfo  # history, leaves [generation, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Bilevel:
     """Algorithm 1 for one seed, as pure functions of its state; made by `make_bilevel`."""
 
     proxy: ProxyEnv
-    mixture: Mixture
-    training: TrainingConfig
     strategy: Strategy
-    objective: Objective
-    scoring: Scoring  # how outcomes become scores
-    evaluators: tuple[Evaluator, ...]  # of one candidate
-    evaluate: Callable[[Candidates], Outcome]  # trains and tests; leaves [evaluation, ...]
+    scoring: Scoring  # by which agents and which objective
+    evaluate: GenerationEvaluator
     unravel: Callable[[Array], PyTree]  # a flat vector [dims] to the proxy's weights
-    params_of: Callable[[Array], PyTree]  # the same to its `EnvParams`
     num_dims: int
     stop_when_solved: bool
-    devices: int | None
 
     @property
     def solved_score(self) -> float | None:
         """Incumbent mean at which the task counts as solved; None if no score says so."""
-        task = self.proxy.task
-        is_return = self.objective.scores_are_returns
-        return task.solved_reward if is_return and task.is_solvable else None
+        task, objective = self.proxy.task, self.scoring.objective
+        return task.solved_reward if objective.scores_are_returns and task.is_solvable else None
 
     def is_solved(self, score: Array) -> Array | bool:
         """Whether a run ends at an incumbent mean."""
@@ -102,7 +89,7 @@ class Bilevel:
         """The state before the first generation, with random weights of the proxy."""
         key_weights, key_es, key_run = jax.random.split(key, 3)
         mean = flat.flatten(self.proxy.init_weights(key_weights))
-        unknown = jnp.full(self.mixture.size, -jnp.inf)
+        unknown = jnp.full(self.scoring.mixture.size, -jnp.inf)
         state = LearnState(
             key=key_run,
             es_state=self.strategy.init(key_es, mean),
@@ -116,7 +103,7 @@ class Bilevel:
             best_generation=jnp.int32(-1),
             solved=jnp.bool_(False),
         )
-        return copy_to_devices(state, self.devices)
+        return copy_to_devices(state, self.evaluate.devices)
 
     def generation(self, state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop; a scan body."""
@@ -124,26 +111,23 @@ class Bilevel:
         return self.tell(state, candidates, self.evaluate(candidates))
 
     def ask(self, state: LearnState) -> Candidates:
-        """The population around the incumbent, and a key for each evaluation."""
+        """The population around the incumbent, and a key for each of their trainings."""
         key = jax.random.fold_in(state.key, state.generation)
         key_ask, key_inner, key_tell = jax.random.split(key, 3)
+        mixture, objective = self.scoring.mixture, self.scoring.objective
         population, es_state = self.strategy.ask(key_ask, state.es_state)
-        incumbent = self.strategy.incumbent(es_state)
-        evaluations, eval_steps = self.strategy.evaluations, self.objective.eval_steps
-        seed_ids = jnp.asarray(evaluations.seed_ids(self.strategy.population_size))
         return Candidates(
             population=population,
-            incumbent=incumbent,
-            params=evaluations.params(population, incumbent),
-            keys=jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids),
+            incumbent=self.strategy.incumbent(es_state),
+            keys=self.strategy.evaluations.keys(key_inner, len(population), mixture.size),
             active=~state.solved,
-            eval_steps=None if eval_steps is None else eval_steps(state.generation),
+            test_params=objective.test_params(state.generation),
             key_tell=key_tell,
             es_state=es_state,
         )
 
     def tell(
-        self, state: LearnState, candidates: Candidates, outcome: Outcome
+        self, state: LearnState, candidates: Candidates, outcomes: Groups[Outcome]
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
@@ -151,13 +135,13 @@ class Bilevel:
         comparison, the search goes on to weights that teach under perturbation too.
         """
         # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
-        outcome = jax.lax.optimization_barrier(outcome)
-        compared = self.scoring.for_strategy(outcome)
+        outcomes = jax.lax.optimization_barrier(outcomes)
+        compared = self.scoring.for_strategy(outcomes)
         es_state = self.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        scores = self.scoring.judged(outcome)
-        score, by_agent = _or_lowest(scores.incumbent_mean), _or_lowest(scores.agent_means)
+        scores = self.scoring.judged(outcomes)
+        score, by_agent = or_lowest(scores.incumbent_mean), or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = state.replace(
             es_state=es_state,
@@ -173,17 +157,9 @@ class Bilevel:
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved
-        return after, self.scoring.info(scores, outcome, state.generation, after.best_score, active)
-
-
-@runtime_checkable
-class RunConfig(Protocol):
-    """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
-
-    @property
-    def generations(self) -> int: ...
-
-    def parts(self) -> dict[str, Any]: ...
+        return after, self.scoring.info(
+            scores, outcomes, state.generation, after.best_score, active
+        )
 
 
 def make_learner(
@@ -240,10 +216,10 @@ def make_bilevel(
     *,
     task: Task,
     agent: Agent | Mixture,
-    proxy: Any = None,
-    es: Any = None,
-    objective: Any = None,
-    training: TrainingConfig | None = None,
+    proxy: ProxyEnv | Makes[ProxyEnv] = SyntheticConfig(),
+    es: Strategy | Makes[Strategy] = NESConfig(),
+    objective: Objective | Makes[Objective] = MaxReward(),
+    training: TrainingConfig = TrainingConfig(),
     stop_when_solved: bool = False,
     devices: int | None = None,
     num_parallel: int | None = None,
@@ -254,8 +230,7 @@ def make_bilevel(
       task: the real task.
       agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
         mixture of agents (`sejax.Mixture`), among which the candidates are divided.
-      proxy, es, objective: by default a one-step SE (`SyntheticConfig()`), NES
-        (`NESConfig()`), and the mean test return.
+      proxy, es, objective: by default a one-step SE, NES, and the mean test return.
       training: how long each agent trains, and how it is tested.
       stop_when_solved: whether a run ends at its first incumbent mean that solves the task.
       devices: devices to spread the candidates over; None for all.
@@ -264,40 +239,24 @@ def make_bilevel(
     Raises:
       ConfigError: if the parts do not fit each other, or there are not so many devices.
     """
-    _made("task", Task, task)
-    proxy = _made("proxy", ProxyEnv, proxy or SyntheticConfig(), task)  # type: ignore[type-abstract]
+    require_part("task", Task, task)
+    proxy = made("proxy", ProxyEnv, proxy, task)  # type: ignore[type-abstract]
     must = f"must be one of the task given; got one of {proxy.task.name}. Set task to the proxy's."
     require(proxy.task is task, "proxy", must)
-    objective = _made("objective", Objective, objective or MaxReward(), task)
+    objective = made("objective", Objective, objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
     unravel = flat.inverse_of_flatten(shapes)
-    strategy = _made("es", Strategy, es or NESConfig(), num_dims)
-    mixture = Mixture.of(agent)
-    training = training or TrainingConfig()
-    training = tested_throughout(training) if objective.needs_tests else training
-    evaluators = evaluators_of(mixture, proxy, training)
-    scoring = Scoring.of(objective, strategy, mixture)
-
-    def params_of(vector: Array) -> PyTree:
-        return proxy.params(unravel(vector))
-
+    strategy = made("es", Strategy, es, num_dims)
+    scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,
-        mixture=mixture,
-        training=training,
         strategy=dataclasses.replace(strategy, evaluations=scoring.evaluations),
-        objective=objective,
         scoring=scoring,
-        evaluators=evaluators,
-        evaluate=make_population_evaluator(
-            evaluators, params_of, scoring.agent_of_evaluation, devices, num_parallel
-        ),
+        evaluate=GenerationEvaluator(proxy, unravel, training, scoring, devices, num_parallel),
         unravel=unravel,
-        params_of=params_of,
         num_dims=num_dims,
         stop_when_solved=stop_when_solved,
-        devices=devices,
     )
     require(
         not stop_when_solved or bilevel.solved_score is not None,
@@ -305,17 +264,3 @@ def make_bilevel(
         "must be false where no score of this objective, task and mixture says solved; got true.",
     )
     return bilevel
-
-
-def _made(group: str, kind: type[T], part: Any, *arguments: Any) -> T:
-    """A part that is given as it is, or as a configuration that makes it."""
-    if arguments and not isinstance(part, kind) and hasattr(part, "make"):
-        part = registry.make(group, part, *arguments)
-    fix = "Pass an object; sejax.config([...]) takes names."
-    must = f"must be a sejax.{kind.__name__}; got {shortened(repr(part))}. {fix}"
-    require(isinstance(part, kind), group, must)
-    return part
-
-
-def _or_lowest(scores: Array) -> Array:
-    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)

@@ -6,30 +6,23 @@ Agents".
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, Hparams
-from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment
 from sejax.envs.wrappers import repeat_actions
-from sejax.es.base import StrategyState
 from sejax.objectives import Outcome
 from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.ops.parallel import (
-    compiler_options,
-    spread_groups_over_devices,
-    spread_over_devices,
-)
+from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import LARGEST, require
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import (
@@ -59,8 +52,7 @@ class Tests(NamedTuple):
     Attributes:
       returns: return of each episode within the task's step limit.
       num_steps: steps of each.
-      scored: return of the first `eval_steps` steps, which may be fewer or more than the task's
-        limit; equal to `returns` if `eval_steps` was not given.
+      scored: sum of `info["scored_reward"]`, of the reward where a step does not have it.
     """
 
     returns: Float[Array, " episode"]
@@ -75,20 +67,19 @@ class _Episode:
     active: Array
     num_steps: Array  # of the task
     total: Array
-    scored: Array  # return of the steps that count for the objective
+    scored: Array
     obs: Array
     env_state: PyTree
 
 
 class _Greedy:
-    """One greedy episode of an agent on a task: its beginning, and each step."""
+    """One greedy episode of an agent in an environment: its beginning, and each step."""
 
-    def __init__(self, agent: Agent, env: Any, params: Any = None):
-        self.agent, self.params = agent, params
-        self.env = repeat_actions(env, agent.spec.action_repeat)
+    def __init__(self, agent: Agent, env: Environment):
+        self.agent, self.env = agent, env
 
-    def begin(self, key: Array, active: Array | bool, params: Any = None) -> _Episode:
-        obs, env_state = self.env.reset_env(key, self.params if params is None else params)
+    def begin(self, key: Array, active: Array | bool, params: PyTree) -> _Episode:
+        obs, env_state = self.env.reset_env(key, params)
         return _Episode(
             active=jnp.asarray(active),
             num_steps=jnp.int32(0),
@@ -99,107 +90,70 @@ class _Greedy:
         )
 
     def step(
-        self,
-        key: Array,
-        agent_state: AgentState,
-        before: _Episode,
-        eval_steps: Array | None = None,
-        own_params: Any = None,
+        self, key: Array, agent_state: AgentState, before: _Episode, params: PyTree
     ) -> tuple[_Episode, Steps]:
-        """The episode after a decision, and the decision; `key` is that of the whole episode.
-
-        With `eval_steps` the episode may last that long, beyond the task's limit too. `own_params`
-        are the environment's in this episode, if not those of all.
-        """
-        params = self.params if own_params is None else own_params
+        """The episode after a decision, and the decision; `key` is that of the whole episode."""
         key_act, key_env = step_keys(key, before.num_steps, 2)
         action = self.agent.act(key_act, agent_state, before.obs, explore=False)
         action = self.agent.env_action(action)
-        longest = params
-        is_within: Any = True  # the task's limit, where a repeated action ends too
-        if eval_steps is not None:
-            limit = params.max_steps_in_episode
-            is_within, most = before.num_steps < limit, jnp.maximum(limit, eval_steps)
-            longest = params.replace(max_steps_in_episode=most)
-            params = params.replace(max_steps_in_episode=jnp.where(is_within, limit, most))
         obs, env_state, reward, terminated, info = self.env.step_env(
             key_env, before.env_state, action, params
         )
-        truncated = self.env.is_truncated(env_state, longest)
-        total = scored = before.scored + reward
-        if eval_steps is not None:
-            total = jnp.where(is_within, before.total + reward, before.total)
-            scored = jnp.where(before.num_steps < eval_steps, scored, before.scored)
+        truncated = self.env.is_truncated(env_state, params)
         after = _Episode(
             active=~(terminated | truncated),
             num_steps=before.num_steps + info.get("num_steps", 1),
-            total=total,
-            scored=scored,
+            total=before.total + reward,
+            scored=before.scored + info.get("scored_reward", reward),
             obs=obs,
             env_state=env_state,
         )
-        made = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
-        return after, made
+        steps = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
+        return after, steps
 
 
-def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Tests]:
-    """Builds `test(key, agent_state, active=True, eval_steps=None) -> Tests`.
+def make_tester(
+    agent: Agent,
+    task: Task,
+    num_episodes: int,
+    test_env: Callable[[Environment], Environment] = lambda env: env,
+) -> Callable[..., Tests]:
+    """Builds `test(key, agent_state, active=True, params=None) -> Tests`.
 
     Episodes on the real task without exploration, each from a fresh initial state. With
     `active=False` nothing is played and all results are 0.
+
+    Args:
+      agent: whose actions are played.
+      task: the real task, whose params are the default ones.
+      num_episodes: of each test.
+      test_env: what the episodes are played in, given the task's environment with the agent's
+        action repeat; by default that itself.
     """
-    play = _make_player(_Greedy(agent, task.env, task.params), num_episodes)
-
-    def test(
-        key: Array,
-        agent_state: AgentState,
-        active: Array | bool = True,
-        eval_steps: Array | None = None,
-    ) -> Tests:
-        return play(key, agent_state, active, eval_steps, None)
-
-    return test
-
-
-def make_proxy_tester(agent: Agent, proxy: Any, num_episodes: int) -> Callable[..., Tests]:
-    """Builds `test(key, agent_state, env_params, active=True) -> Tests`: episodes on a proxy.
-
-    As of `make_tester`, but on the proxy with these weights.
-    """
-    play = _make_player(_Greedy(agent, proxy), num_episodes)
-    return lambda key, agent_state, env_params, active=True: play(
-        key, agent_state, active, None, env_params
-    )
-
-
-def _make_player(greedy: _Greedy, num_episodes: int) -> Callable[..., Tests]:
-    """Builds `play(key, agent_state, active, eval_steps, params) -> Tests`."""
+    env = repeat_actions(task.env, agent.spec.action_repeat)
+    greedy = _Greedy(agent, test_env(env))
 
     def step(
         nothing: Array, state: _Episode, consts: PyTree, masked: bool
     ) -> tuple[Array, _Episode]:
-        key, agent_state, eval_steps, params = consts
-        after, _ = greedy.step(key, agent_state, state, eval_steps, params)
+        key, agent_state, params = consts
+        after, _ = greedy.step(key, agent_state, state, task.params if params is None else params)
         return nothing, after
 
-    def episode(
-        key: Array,
-        agent_state: AgentState,
-        active: Array | bool,
-        eval_steps: Array | None,
-        params: PyTree,
-    ) -> Tests:
+    def episode(key: Array, agent_state: AgentState, active: Array | bool, params: PyTree) -> Tests:
         key_reset, key_steps = jax.random.split(key)
-        state = greedy.begin(key_reset, active, params)
-        consts = (key_steps, agent_state, eval_steps, params)
+        state = greedy.begin(key_reset, active, task.params if params is None else params)
+        consts = (key_steps, agent_state, params)
         _, state = while_any_active(step, jnp.zeros(0), state, consts)
         return Tests(state.total, state.num_steps, state.scored)
 
-    def play(key: Array, *arguments: PyTree) -> Tests:
+    def test(
+        key: Array, agent_state: AgentState, active: Array | bool = True, params: PyTree = None
+    ) -> Tests:
         keys = jax.random.split(key, num_episodes)
-        return jax.vmap(episode, in_axes=(0, None, None, None, None))(keys, *arguments)
+        return jax.vmap(episode, in_axes=(0, None, None, None))(keys, agent_state, active, params)
 
-    return play
+    return test
 
 
 def make_recorder(
@@ -210,16 +164,16 @@ def make_recorder(
     The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
     one step here.
     """
-    greedy = _Greedy(agent, task.env, task.params)
+    greedy = _Greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
 
     def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
-            after, made = greedy.step(key_steps, agent_state, state)
-            return after.replace(active=state.active & after.active), made
+            after, steps = greedy.step(key_steps, agent_state, state, task.params)
+            return after.replace(active=state.active & after.active), steps
 
-        start = greedy.begin(key_reset, True)
+        start = greedy.begin(key_reset, True, task.params)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
     def record(key: Array, agent_state: AgentState) -> Steps:
@@ -234,20 +188,25 @@ def make_recorder(
 
 
 def make_evaluator(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig
+    agent: Agent,
+    env: Environment,
+    task: Task,
+    training: TrainingConfig,
+    test_env: Callable[[Environment], Environment] = lambda env: env,
 ) -> Callable[..., Outcome]:
-    """Builds `evaluate(key, env_params, active=True, eval_steps=None) -> Outcome`.
+    """Builds `evaluate(key, env_params, active=True, test_params=None) -> Outcome`.
 
     A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
-    agent's hyperparameters are drawn, they are drawn from the same key first. `eval_steps` is the
-    length of the test episodes that the objective scores; default: the task's limit.
+    agent's hyperparameters are drawn, they are drawn from the same key first. `test_params` are the
+    params of the test episodes; default: the task's.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
+      test_env: as of `make_tester`, for the test after the training.
 
     Raises:
       ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
@@ -280,20 +239,20 @@ def make_evaluator(
         "env.max_steps=N, or Task(max_steps=N).",
     )
 
-    def make_run(agent: Agent) -> Callable[..., Any]:
-        test = make_tester(agent, task, training.test_episodes)
+    def make_run(agent: Agent) -> Callable[..., Outcome]:
+        test = make_tester(agent, task, training.test_episodes, test_env)
         train = make_tested_trainer(agent, env, task, training)
 
         def run(
             key: Array,
             env_params: PyTree,
             active: Array | bool,
-            eval_steps: Array | None,
+            test_params: PyTree,
             hparams: Hparams,
-        ) -> Any:
+        ) -> Outcome:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
-            tests = test(key_test, result.agent_state, active, eval_steps)
+            tests = test(key_test, result.agent_state, active, test_params)
             real_steps = tests.num_steps.sum() + result.eval_steps
             return Outcome(
                 test_returns=tests.returns,
@@ -308,8 +267,8 @@ def make_evaluator(
         return run
 
     run = agent.fresh(make_run)
-    return lambda key, env_params, active=True, eval_steps=None: run(
-        key, env_params, active, eval_steps
+    return lambda key, env_params, active=True, test_params=None: run(
+        key, env_params, active, test_params
     )
 
 
@@ -426,98 +385,3 @@ def _evaluation_program(
         return spread
 
     return jax.jit(program, compiler_options=compiler_options())
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluator:
-    """How a candidate is evaluated.
-
-    Attributes:
-      run: `(key, env_params, active, eval_steps) -> Outcome`, of one candidate.
-      cpu_num_parallel: candidates in one vmapped batch on a CPU core; None for all.
-    """
-
-    run: Callable[..., Outcome]
-    cpu_num_parallel: int | None
-
-
-def evaluators_of(
-    mixture: Mixture, proxy: ProxyEnv, training: TrainingConfig
-) -> tuple[Evaluator, ...]:
-    """How each agent evaluates a candidate: it trains there, and is tested on the real task."""
-    return tuple(
-        Evaluator(
-            run=make_evaluator(agent, proxy, proxy.task, training),
-            cpu_num_parallel=num_parallel_on_cpu(agent, training),
-        )
-        for agent in mixture.agents
-    )
-
-
-@struct.dataclass
-class Candidates:
-    """What a generation evaluates."""
-
-    population: Float[Array, "pop dims"]  # as the strategy asks for it
-    incumbent: Float[Array, " dims"]
-    params: Float[Array, "evaluation dims"]  # first those of the population, then the incumbent's
-    keys: Array  # of the trainings, [evaluation]
-    active: Array  # whether anything is to be computed
-    eval_steps: Array | None  # length of the test episodes that are scored; None: the task's limit
-    key_tell: Array  # for `Strategy.tell`
-    es_state: StrategyState  # after `Strategy.ask`
-
-
-def make_population_evaluator(
-    evaluators: Sequence[Evaluator],
-    params_of: Callable[[Float[Array, " dims"]], PyTree],
-    agent_of_evaluation: np.ndarray,
-    devices: int | None = None,
-    num_parallel: int | None = None,
-) -> Callable[[Candidates], Outcome]:
-    """Builds `evaluate(candidates) -> Outcome`, leaves `[evaluation]`.
-
-    Evaluations are grouped by evaluator when the program is built, so that no training executes
-    another agent's branch; each group is spread over the devices, and on each of them batches of
-    `num_parallel` follow one another.
-
-    Args:
-      evaluators: how one candidate is evaluated.
-      params_of: a candidate to the proxy's `EnvParams`.
-      agent_of_evaluation: index of the evaluator, `[evaluation]`.
-      devices: None for all.
-      num_parallel: None for what suits each evaluator.
-
-    Raises:
-      ConfigError: if there are fewer than `devices` devices.
-    """
-    groups = [np.flatnonzero(agent_of_evaluation == i) for i in range(len(evaluators))]
-    order = np.argsort(np.concatenate(groups))
-    evaluate_groups = spread_groups_over_devices(
-        [of_vectors(each, params_of) for each in evaluators],
-        devices,
-        num_parallel,
-        [each.cpu_num_parallel for each in evaluators],
-    )
-
-    def evaluate(candidates: Candidates) -> Outcome:
-        def arguments(group: np.ndarray) -> tuple[PyTree, ...]:
-            shared = candidates.active, candidates.eval_steps
-            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), shared)
-            return candidates.keys[group], candidates.params[group], *shared
-
-        outcomes = evaluate_groups([arguments(group) for group in groups])
-        if len(outcomes) == 1:
-            return outcomes[0]
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts)[order], *outcomes)
-
-    return evaluate
-
-
-def of_vectors(
-    evaluator: Evaluator, params_of: Callable[[Float[Array, " dims"]], PyTree]
-) -> Callable[..., Outcome]:
-    """`evaluator.run` for a candidate as a flat vector: `(key, vector, active, eval_steps)`."""
-    return lambda key, vector, active, eval_steps: evaluator.run(
-        key, params_of(vector), active, eval_steps
-    )

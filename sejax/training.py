@@ -4,8 +4,7 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 `docs/reference.md` 3.
 """
 
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentConfig, AgentState, Hparams, Spaces
+from sejax.agents.base import Agent, AgentState, Hparams, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
@@ -28,14 +27,10 @@ from sejax.options import (
     not_negative,
     one_of,
     option,
-    registry,
     require,
     shortened,
 )
-from sejax.options.plain import from_plain
-from sejax.proxies.base import ProxyEnv, episode_limit, is_real, prepare
-from sejax.proxies.header import agents_of, is_registered
-from sejax.proxies.io import Proxy, ProxySet, stored_env
+from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -119,78 +114,6 @@ class TrainingConfig(Options):
     def num_tests_between(self) -> int:
         """Test episodes after each training episode."""
         return max(self.tests_between, int(self.stops_by_tests))
-
-
-def budget_for(
-    training: TrainingConfig,
-    agent: AgentConfig,
-    learned_with: Iterable[AgentConfig],
-    max_episode_steps: int,
-    task_max_steps: int,
-) -> TrainingConfig:
-    """How long an agent trains on a proxy that was learned with others.
-
-    A step budget grows by the steps for which this agent waits longer with learning than any of
-    those: ten long initial episodes, or a rollout of PPO, could use it up. Episodes, which may have
-    one step, grow in number with it. No more steps are asked for than there were episodes for.
-
-    Args:
-      training: that the proxy was learned with.
-      agent: configuration of the agent that is to train.
-      learned_with: of those that the proxy was learned with, as far as they are known.
-      max_episode_steps: that the proxy's episodes may take.
-      task_max_steps: that the real task's may take.
-    """
-    max_steps = training.max_steps
-    if max_steps is None:
-        return training
-    if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
-        max_steps = min(max_steps, training.max_episodes * max_episode_steps)
-    waits, *waited = (
-        each.steps_before_learning(max_episode_steps, task_max_steps)
-        for each in (agent, *learned_with)
-    )
-    longer = max(0, waits - max(waited, default=0))
-    return dataclasses.replace(
-        training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
-    )
-
-
-def training_of(
-    proxy: ProxyEnv | Proxy | ProxySet, agent: AgentConfig | None = None
-) -> TrainingConfig:
-    """How long agents trained on a stored proxy when it was learned.
-
-    Args:
-      proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
-      agent: configuration of another agent that is to train on it, whose budget is then that of
-        `budget_for`; None for the training as it was.
-
-    Raises:
-      ConfigError: for a proxy that is not stored, or if its file does not tell it.
-
-    Example:
-      >>> import sejax
-      >>> training_of(sejax.load_proxy("cartpole")).stop_rule
-      'never'
-    """
-    env, config = stored_env(proxy)
-    stored: Any = config.get("training")
-    require(
-        isinstance(stored, Mapping),
-        "training",
-        f"must be given for {shortened(env.name)}, which does not say how long its agents "
-        "trained; got none. Set training=sejax.TrainingConfig(...).",
-    )
-    training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
-    if agent is None:
-        return training
-    known = [
-        registry.configure("agent", values)
-        for values in agents_of(config).values()
-        if is_registered("agent", values)
-    ]
-    return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
 
 
 def require_modes() -> None:

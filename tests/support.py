@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from sejax.options import ConfigError
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.training import TrainingConfig
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.

@@ -116,7 +116,8 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     assert (states[0].incumbent != others[0].incumbent).any()
     assert len({float(info.population_mean) for info in infos}) == 3
     asked = [program.ask(state).keys for state in (states[0], states[1], others[0])]
-    data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in asked])
+    groups = [keys for groups in asked for keys in groups]
+    data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in groups])
     assert len(data) == 3 * program.strategy.num_evaluations
     assert len(np.unique(data, axis=0)) == len(data)
 
@@ -128,37 +129,20 @@ def test_perturbations_are_drawn_anew_in_each_generation(one_device):
     assert np.abs(np.corrcoef(*(x.ravel() for x in drawn))[0, 1]) < 0.5
 
 
-def test_common_random_numbers_are_common_to_the_members_alone():
-    program = program_of("es.common_random_numbers=true", "es.num_evals=2", words=ROOM)
-    keys = np.asarray(jax.random.key_data(program.ask(program.init(KEYS[0])).keys))
-    ids = program.strategy.evaluations.seed_ids(program.strategy.population_size)
-    same = (keys[:, None] == keys[None]).all(axis=-1)
-    np.testing.assert_array_equal(same, np.equal.outer(ids, ids))
-    assert 1 < len(np.unique(ids)) < len(ids)
-
-
-def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
-    """A generation is ask, the trials one by one with tests of one step, and tell."""
+def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
+    """A generation is ask, the trainings one by one with tests of one step, and tell."""
     config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)
-    parts = config.parts()
-    program, task = make_bilevel(**parts), parts["task"]
-    proxy = registry.make("proxy", config.proxy, task)
-    agent = sejax.make_agent(config.agent, task)
-    evaluate = sejax.make_evaluator(agent, proxy, task, config.training)
+    program = make_bilevel(**config.parts())
     state = program.init(KEYS[0])
-    asked = program.ask(state)
-    assert asked.eval_steps == 1 < task.max_steps
-
-    def one(trial):
-        key, candidate = trial
-        return evaluate(key, proxy.params(program.unravel(candidate)), True, jnp.int32(1))
-
-    outcome = jax.jit(lambda: jax.lax.map(one, (asked.keys, asked.params)))()
+    candidates = program.ask(state)
+    assert candidates.test_params.scored_steps == 1 < program.proxy.task.max_steps
+    (trainings,), (run,) = program.evaluate.trainings(candidates), program.evaluate.runs
+    outcome = jax.jit(lambda: jax.lax.map(run, trainings))()
     assert (outcome.scored_returns != outcome.test_returns).any()
     after, info = jax.jit(program.generation)(state)
-    told, wanted = program.tell(state, asked, outcome)
-    np.testing.assert_allclose(after.es_state.mean, told.es_state.mean, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(info.incumbent_mean, wanted.incumbent_mean, rtol=1e-6)
+    expected, expected_info = program.tell(state, candidates, program.evaluate.outcomes([outcome]))
+    np.testing.assert_allclose(after.es_state.mean, expected.es_state.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(info.incumbent_mean, expected_info.incumbent_mean, rtol=1e-6)
 
 
 def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
@@ -184,7 +168,8 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
         test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
         auc=part[..., 0], nonfinite=counts < 0, real_steps=counts,
     )  # fmt: skip
-    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
+    outcomes = program.evaluate.outcomes([outcome])
+    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcomes)))(
         state
     )
     # All Better 2 with one member that is better: the mean moves to it.

@@ -13,9 +13,8 @@ from gymnax.environments import spaces
 from support import refused
 
 from sejax import envs
-from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 from sejax.envs.environment import spaces_of
-from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
+from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2, GridParams, GridWorld
 from sejax.gym import GYMNASIUM_IDS
 from sejax.options import ConfigError, registry
 

@@ -22,10 +22,10 @@ from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.ops.files import require_writable
 from sejax.options import registry
+from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
 from sejax.runs import plots, progress
 from sejax.runs.worlds import proxy_setup
-from sejax.training import budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip

@@ -11,7 +11,7 @@ import sejax
 from sejax.envs.base import Task
 from sejax.envs.spec import Box, Discrete, TaskSpec
 from sejax.options import ConfigError
-from sejax.proxies.base import AbsentEnv
+from sejax.proxies.absent import AbsentEnv
 from sejax.proxies.exact import gaussian, make_exact
 
 RNG = np.random.default_rng(0)

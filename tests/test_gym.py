@@ -335,7 +335,7 @@ def test_what_ships_is_registered_once_and_by_its_name():
     np.testing.assert_array_equal(env.reset(seed=1)[0], make("cartpole").reset(seed=1)[0])
 
 
-def test_it_runs_without_jax_and_in_forked_processes():
+def test_it_starts_no_backend_of_jax_and_runs_in_forked_processes():
     program = """
 import sys
 import sejax
@@ -349,11 +349,12 @@ env.step(1)
 sejax.gym.make("cartpole-rn").reset(seed=0)
 envs = AsyncVectorEnv([lambda: sejax.gym.make("cartpole")] * 2, context="fork")
 envs.reset(seed=0)
-loaded = {"jax", "flax", "jaxtyping", "stable_baselines3", "torch"} & set(sys.modules)
-print(envs.step([0, 1])[0].shape, sorted(loaded))
+loaded = {"stable_baselines3", "torch"} & set(sys.modules)
+from jax._src import xla_bridge
+print(envs.step([0, 1])[0].shape, sorted(loaded), xla_bridge.backends_are_initialized())
 envs.close()
 """
-    assert printed(sys.executable, "-c", program) == "(2, 4) []\n"
+    assert printed(sys.executable, "-c", program) == "(2, 4) [] False\n"
 
 
 # --- tasks ---------------------------------------------------------------------------------------

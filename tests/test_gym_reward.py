@@ -23,8 +23,7 @@ from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
 from sejax.gym import GridWorld, RewardNetwork, make, networks
 from sejax.options import registry
 from sejax.proxies import header
-from sejax.proxies.configs import VARIANTS, RewardConfig
-from sejax.proxies.reward import RewardState
+from sejax.proxies.reward import VARIANTS, RewardConfig, RewardState
 
 KEY = jax.random.key(0)
 NETWORKS = [variant for variant in VARIANTS if "info" not in variant]

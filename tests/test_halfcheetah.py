@@ -10,7 +10,7 @@ from support import has_compiler, numpy_forward, refused
 import sejax
 from sejax import envs
 from sejax.envs.environment import EnvState
-from sejax.proxies.configs import RewardConfig
+from sejax.proxies.reward import RewardConfig
 
 # brax calls parts of MuJoCo XLA that have been given other names.
 pytestmark = pytest.mark.filterwarnings(

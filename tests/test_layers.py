@@ -16,8 +16,11 @@ LAYERS = [
     {"searching", "distillation"},
     {"runs"},
     {"bilevel"},
-    {"evaluation"},
-    {"training", "objectives", "gym"},
+    {"generation"},
+    {"evaluation", "scoring"},
+    {"gym"},
+    {"stored proxies"},
+    {"training", "objectives"},
     {"proxies"},
     {"agents"},
     {"envs", "es"},
@@ -25,6 +28,9 @@ LAYERS = [
     {"options"},
     {""},
 ]
+
+
+STORE = {f"sejax.proxies.{name}" for name in ("absent", "exact", "header", "hub", "io", "zoo")}
 
 
 def name_of(path):
@@ -38,6 +44,8 @@ TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
 
 def part_of(module):
     """The module of the package's top, or the folder, that a module is or lies in."""
+    if module in STORE:
+        return "stored proxies"
     return module.split(".")[1] if "." in module else ""
 
 

@@ -14,10 +14,12 @@ import sejax
 from sejax import envs
 from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
+from sejax.es.base import Groups
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
-from sejax.objectives import MaxReward, Outcome, Scoring
+from sejax.objectives import MaxReward, Outcome
 from sejax.options import registry
+from sejax.scoring import Scoring
 from sejax.training import TrainingConfig
 
 NAN, INF = np.nan, np.inf
@@ -40,17 +42,26 @@ def mixture(num=2, weights=(), **config):
 # --- which agent trains where --------------------------------------------------------------------
 
 
-def test_candidates_go_to_the_agent_that_is_furthest_behind_its_share():
-    # Shares 1/2, 1/3 and 1/6; after each place, share times places less places had:
-    # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
-    # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
-    dealt = mixture(3, weights=(3.0, 2.0, 1.0)).agent_of_candidate(12)
-    np.testing.assert_array_equal(dealt, [0, 1, 0, 2, 1, 0] * 2)
-    np.testing.assert_array_equal(mixture(2).agent_of_candidate(5), [0, 1, 0, 1, 0])
-    np.testing.assert_array_equal(mixture(1).agent_of_candidate(3), [0, 0, 0])
-    # An agent of weight 0 trains on incumbents alone, and needs no candidate.
-    np.testing.assert_array_equal(mixture(2, weights=(0.0, 3.0)).agent_of_candidate(3), [1, 1, 1])
-    np.testing.assert_array_equal(mixture(2, weights=(0.0, 3.0)).agent_of_candidate(1), [1])
+@pytest.mark.parametrize(
+    ("weights", "population_size", "candidates"),
+    [
+        # Shares 1/2, 1/3 and 1/6; after each candidate, share times candidates less those had:
+        # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
+        # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
+        ((3.0, 2.0, 1.0), 12, ([0, 2, 5, 6, 8, 11], [1, 4, 7, 10], [3, 9])),
+        ((1.0, 1.0), 5, ([0, 2, 4], [1, 3])),
+        ((1.0,), 3, ([0, 1, 2],)),
+        # An agent of weight 0 trains on incumbents alone, and needs no candidate.
+        ((0.0, 3.0), 3, ([], [0, 1, 2])),
+        ((0.0, 3.0), 1, ([], [0])),
+    ],
+)
+def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_size, candidates):
+    agents = mixture(len(weights), weights=weights)
+    assert tuple(x.tolist() for x in agents.deal(population_size)) == candidates
+    pairs = agents.deal(2 * population_size, antithetic=True)
+    mirrored = tuple(x + [population_size + i for i in x] for x in candidates)
+    assert tuple(x.tolist() for x in pairs) == mirrored
 
 
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
@@ -66,8 +77,8 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
         (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
         (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
         (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
-        (lambda: mixture(3).agent_of_candidate(4, antithetic=True), "es.population_size"),
-        (lambda: mixture(2, weights=(10.0, 1.0)).agent_of_candidate(4), "es.population_size"),
+        (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
+        (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
         (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
         (lambda: MixtureConfig(compared_by="x"), "agents.compared_by"),
     ],
@@ -107,7 +118,8 @@ def plain_comparable(scores, agent, incumbents, compared_by):
 def compare(scores, agent, incumbents, by):
     """`comparable` of as many agents as there are incumbents' means, in NumPy."""
     comparable = mixture(len(incumbents), compared_by=by).comparable
-    jitted = jax.jit(lambda scores, means: comparable(scores, np.array(agent), means))
+    candidates = [np.flatnonzero(np.array(agent) == i) for i in range(len(incumbents))]
+    jitted = jax.jit(lambda scores, means: comparable(scores, candidates, means))
     return jax.device_get(jitted(np.float32(scores), np.float32(incumbents)))
 
 
@@ -132,12 +144,17 @@ def scoring_of(weights, es, **config):
     return Scoring.of(MaxReward().make(TASK), es.make(4), agents)
 
 
+def outcomes_of(population, incumbent, num_agents):
+    """Outcomes of these test returns; nan for agents that diverged. The incumbent's take turns."""
+    incumbent = np.reshape(incumbent, (-1, num_agents))
+    return Groups(outcome_of(np.reshape(population, (-1, 1))), outcome_of(incumbent))
+
+
 def outcome_of(returns):
-    """The outcome of agents with these test returns; nan for those that diverged."""
     returns = jnp.float32(returns)
     counts = jnp.ones(returns.shape, jnp.int32)
     return Outcome(
-        test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
+        test_returns=returns[..., None], scored_returns=returns[..., None], train_steps=counts,
         train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
     )  # fmt: skip
 
@@ -155,12 +172,12 @@ def test_an_incumbents_score_aggregates_the_means_of_its_agents(aggregate, weigh
     es = NESConfig(population_size=4, num_incumbent_evals=len(weights))
     scoring = scoring_of(weights, es, aggregate=aggregate)
     means = [200.0, 10.0, 140.0][: len(weights)]
-    scores = scoring.judged(outcome_of([7.0] * 8 + means))
+    scores = scoring.judged(outcomes_of([7.0] * 8, means, len(means)))
     np.testing.assert_allclose(scores.incumbent_mean, score, rtol=1e-6)
     # People see returns.
     np.testing.assert_array_equal(scores.agent_means, means)
-    np.testing.assert_array_equal(scores.incumbent, means)
-    np.testing.assert_array_equal(scores.population, [7.0] * 8)
+    np.testing.assert_array_equal(scores.incumbent, [means])
+    np.testing.assert_array_equal(scores.population, [[7.0]] * 8)
 
 
 # --- Algorithm 1 ---------------------------------------------------------------------------------
@@ -189,10 +206,10 @@ def two():
     @jax.jit
     def generation(state):
         candidates = bilevel.ask(state)
-        outcome = bilevel.evaluate(candidates)
-        return candidates, outcome, *bilevel.tell(state, candidates, outcome)
+        outcomes = bilevel.evaluate(candidates)
+        return candidates, outcomes, *bilevel.tell(state, candidates, outcomes)
 
-    candidates, outcome, after, info = generation(state)
+    candidates, outcomes, after, info = generation(state)
     # Candidates 0 1 0 of each sign, two evaluations each; four of the incumbent, 3 rounded up.
     agent = np.array([0, 0, 1, 1, 0, 0] * 2 + [0, 1, 0, 1])
     by_agent = []
@@ -203,19 +220,26 @@ def two():
             key, params = evaluation
             return evaluate(key, PROXY.params(bilevel.unravel(params)))
 
-        evaluations = (candidates.keys, candidates.params)
+        vectors = np.repeat(candidates.population, 2, axis=0), [candidates.incumbent] * 4
+        keys = jnp.concatenate([group.ravel() for group in candidates.keys])
+        evaluations = keys, jnp.concatenate([jnp.asarray(group) for group in vectors])
         run = jax.jit(lambda x, one=one: jax.lax.map(one, x))
         by_agent.append(jax.device_get(run(evaluations)))
     assert np.mean(by_agent[0].auc != by_agent[1].auc) > 0.5  # the agents differ on most
     expected = jax.tree.map(lambda *x: np.stack([x[a][i] for i, a in enumerate(agent)]), *by_agent)
     return SimpleNamespace(
-        bilevel=bilevel, before=state, candidates=candidates, outcome=outcome, after=after,
+        bilevel=bilevel, before=state, candidates=candidates, outcomes=outcomes, after=after,
         info=info, agent=agent, expected=expected,
     )  # fmt: skip
 
 
 def test_each_candidate_is_trained_by_its_agent_and_no_other(two):
-    jax.tree.map(np.testing.assert_array_equal, jax.device_get(two.outcome), two.expected)
+    population, incumbent = jax.device_get(two.outcomes)
+    assert population.auc.shape == (6, 2) and incumbent.auc.shape == (2, 2)
+    flat = jax.tree.map(
+        lambda *x: np.concatenate([y.reshape(-1, *y.shape[2:]) for y in x]), population, incumbent
+    )
+    jax.tree.map(np.testing.assert_array_equal, flat, two.expected)
 
 
 def test_a_generation_tells_the_advantages_over_each_agents_incumbent(two):
@@ -275,9 +299,9 @@ def told(incumbents, state=None, stop_when_solved=True, **config):
         Mixture(agents=AGENTS, config=MixtureConfig(**config)), stop_when_solved=stop_when_solved,
         es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=len(incumbents)),
     )  # fmt: skip
-    outcome = outcome_of([0, 0, *incumbents])
+    outcomes = outcomes_of([0, 0], incumbents, 2)
     state = bilevel.init(KEY) if state is None else state
-    return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcome))(state)
+    return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcomes))(state)
 
 
 @pytest.mark.parametrize(("aggregate", "score"), [("mean", 0.25), ("min", -0.25)])

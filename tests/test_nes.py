@@ -23,19 +23,22 @@ MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
 def whole_generations(strategy):
     """`ask` and `tell` of all that a generation tries, the incumbent included, as bilevel.py does.
 
-    `ask(key, state) -> (candidates, state)`, `tell(key, candidates, scores, state) -> state`.
+    `ask(key, state) -> (candidates, state)`, `tell(key, candidates, scores, state) -> state`. The
+    evaluations of a candidate follow one another; those of the incumbent come last.
     """
     evaluations = strategy.evaluations
+    num_evals, size = evaluations.num_evals, strategy.population_size
 
     def ask(key, state):
         population, state = strategy.ask(key, state)
-        return evaluations.params(population, strategy.incumbent(state)), state
+        incumbent = jnp.tile(strategy.incumbent(state), (evaluations.num_incumbent_evals, 1))
+        return jnp.concatenate([jnp.repeat(population, num_evals, axis=0), incumbent]), state
 
     def tell(key, candidates, scores, state):
-        of_population, of_incumbent = evaluations.split(scores)
-        population = candidates[: of_population.shape[0] : evaluations.num_evals]
+        of_population, of_incumbent = jnp.split(scores, [size * num_evals])
         _, incumbent = evaluations.incumbent_scores(of_incumbent, of_population)
-        scores = evaluations.population_scores(of_population)
+        scores = evaluations.population_scores(of_population.reshape(size, num_evals))
+        population = candidates[: size * num_evals : num_evals]
         return strategy.tell(key, population, scores, incumbent, state)
 
     return ask, tell

@@ -33,18 +33,16 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
     # From 20 steps in generation 0 to the task's 200 in generation 40: 4.5 more in each.
     objective = MaxReward(first_eval_steps=20, curriculum_generations=40).make(task())
     generations = jnp.array([0, 1, 2, 20, 39, 40, 1000])
-    steps = objective.eval_steps(generations)
+    steps = objective.test_params(generations).scored_steps
     np.testing.assert_array_equal(steps, [20, 24, 29, 110, 196, 200, 200])  # halves to even
     assert steps.dtype == jnp.int32
     long = MaxReward(first_eval_steps=1000, curriculum_generations=8).make(task())
-    np.testing.assert_array_equal(long.eval_steps(generations[:3]), [1000, 900, 800])
+    np.testing.assert_array_equal(long.test_params(generations[:3]).scored_steps, [1000, 900, 800])
     # Members are worth the part that is scored, incumbents whole episodes.
     ended = outcome([10.0, 200.0, -3.0], [1, 2, 3], [False, False, True])
     np.testing.assert_array_equal(objective(ended), [20.0, 400.0, np.nan])
     np.testing.assert_array_equal(objective.judged(ended), [10.0, 200.0, np.nan])
-    assert MaxReward().make(task()).eval_steps is None
-    own = Objective(score=lambda outcome: outcome.scored_returns.mean(axis=-1), eval_steps=len)
-    np.testing.assert_array_equal(own.judged(ended), [10.0, 200.0, np.nan])  # one of your own too
+    assert MaxReward().make(task()).test_params(0) is None
 
 
 @pytest.mark.parametrize(

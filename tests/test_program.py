@@ -9,7 +9,7 @@ from support import large_ops_in_loops, paper_se, paper_training
 from sejax import envs
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.options import registry
-from sejax.proxies.configs import RewardConfig
+from sejax.proxies.reward import RewardConfig
 from sejax.training import make_trainer
 
 CAPACITY = 7919  # rows of the replay buffer

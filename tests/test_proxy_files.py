@@ -19,7 +19,7 @@ from sejax import envs
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import header
-from sejax.proxies.configs import RewardConfig
+from sejax.proxies.reward import RewardConfig
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
 

@@ -10,15 +10,14 @@ from gymnax.environments.classic_control import cartpole
 from support import numpy_forward, refused
 
 import sejax
-from sejax import bilevel, envs
+from sejax import bilevel, envs, generation
 from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
-from sejax.proxies.configs import RewardConfig
-from sejax.proxies.reward import RewardEnv
+from sejax.proxies.reward import RewardConfig, RewardEnv
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 GAMMA = 0.9
@@ -242,12 +241,11 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     """One that ended there would reward learning late."""
     config = sejax.config([*LEARN, f"objective={objective}"])
     assert config.training.stop_rule == "solved"
-    asked = []
-    monkeypatch.setattr(bilevel, "evaluators_of", lambda *parts: asked.append(parts[-1]))
-    monkeypatch.setattr(bilevel, "make_population_evaluator", lambda *_: None)
-    bilevel.make_bilevel(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
-    assert asked == [dataclasses.replace(config.training, **changes)]
+    monkeypatch.setattr(generation, "make_evaluator", lambda *parts: trainings.append(parts[3]))
+    trainings = []
+    bilevel.make_bilevel(**config.parts())
+    assert trainings == [dataclasses.replace(config.training, **changes)]
 
 
 def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_it():

@@ -8,7 +8,7 @@ import pytest
 import sejax
 from sejax import envs
 from sejax.options import ConfigError
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import config as configuration
 
 FORMS = {

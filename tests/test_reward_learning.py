@@ -8,7 +8,7 @@ import sejax
 from experiments.common.reward_networks import OBJECTIVES
 from sejax.bilevel import make_learner
 from sejax.options import registry
-from sejax.proxies.configs import VARIANTS
+from sejax.proxies.reward import VARIANTS
 
 pytestmark = [
     pytest.mark.slow,

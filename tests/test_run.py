@@ -381,7 +381,7 @@ def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys
 BROKEN = """
 import math
 import sejax
-from sejax.envs.dynamics.gridworld import GridParams, GridWorld
+from sejax.envs.gridworld import GridParams, GridWorld
 
 def make(reward: float = math.nan):
     params = GridParams(step_reward=reward, goal_reward=reward)

@@ -12,7 +12,7 @@ from sejax import envs
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 
 CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])

@@ -19,6 +19,7 @@ from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
+from sejax.envs.wrappers import PartlyScored, PartParams
 from sejax.evaluation import make_recorder, make_tester
 from sejax.options import ConfigError, registry
 from sejax.training import is_plateau, is_solved, make_trainer
@@ -513,22 +514,29 @@ def scripted_state():
     return agent.begin_episode(agent.init(KEY, 0.0), 0)
 
 
+def partly_scored(agent, num_episodes):
+    """Tests in which so many steps are scored as their params say."""
+    task = scripted_task(99)
+    return make_tester(agent, task, num_episodes, lambda env: PartlyScored(env, task.params))
+
+
 def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
     # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in the last one.
-    test = jax.jit(make_tester(scripted_agent(), scripted_task(99), 2))
-    for eval_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
-        tests = test(KEY, scripted_state(), True, jnp.int32(eval_steps))
+    test = jax.jit(partly_scored(scripted_agent(), 2))
+    for scored_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
+        tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(scored_steps)))
         np.testing.assert_array_equal(tests.scored, [scored] * 2)
         np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
         np.testing.assert_array_equal(tests.num_steps, [played] * 2)
-    tests = test(KEY, scripted_state(), False, jnp.int32(4))
+    tests = test(KEY, scripted_state(), False, PartParams(scored_steps=jnp.int32(4)))
     assert not tests.returns.any() and not tests.num_steps.any()  # do not begin
 
 
 def test_actions_are_repeated_beyond_the_tasks_limit_too():
     # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
     agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
-    tests = make_tester(agent, scripted_task(99), 1)(KEY, scripted_state(), True, jnp.int32(9))
+    test = partly_scored(agent, 1)
+    tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(9)))
     assert tests.num_steps == 9 and tests.returns == 2.5
 
 

@@ -174,7 +174,7 @@ def test_generations_are_whole_whatever_workers_do(seed):
 def remote_chunks(config, ray):
     """The generations of a run on workers of a planned cluster."""
     learner = make_bilevel(**config.parts() | {"devices": 1})
-    size = len(learner.evaluators)
+    size = len(learner.evaluate.sizes)
     arguments = configuration.plain(config), [5] * size, 0.0, runtime.versions()
     pool = ray.pool(lambda: workers.Worker(*arguments))
     return RemoteChunks(learner, pool, [Batch(capacity=5, width=1)] * size)

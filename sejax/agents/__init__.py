@@ -59,7 +59,7 @@ def names() -> list[str]:
 def make_agent(
     config: AgentConfig,
     task: Task,
-    exploration: ExplorationConfig = NoExploration(),  # noqa: B008 (frozen)
+    exploration: ExplorationConfig = NoExploration(),
     varied: bool = False,
 ) -> Agent:
     """The agent for a task's observations and actions; the same object for the same arguments.

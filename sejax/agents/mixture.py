@@ -5,6 +5,7 @@ chance. Here the candidates of a generation are divided among several agents, so
 outer loop helps all of them, at the same number of trainings.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sejax.agents.base import Agent
-from sejax.es.base import AGGREGATES, finite_mean, is_tie
+from sejax.ops.scores import finite_mean, is_tie
 from sejax.options import Options, one_of, option, require, shortened
 
 COMPARED_BY = ("advantage", "rank")
@@ -28,7 +29,7 @@ class MixtureConfig(Options):
 
     aggregate: str = option(
         "mean",
-        one_of(AGGREGATES),
+        one_of(("mean", "min")),
         help=(
             "The incumbent's score, given its mean with each agent: the mean of those, or the "
             "worst."
@@ -65,8 +66,8 @@ class Mixture:
       >>> ddqn, ppo = (sejax.make_agent(config, task)
       ...              for config in (sejax.DDQNConfig(), sejax.PPOConfig()))
       >>> mixture = Mixture(agents=(ddqn, ppo), names=("ddqn", "ppo"), weights=(2.0, 1.0))
-      >>> mixture.agent_of_candidate(6).tolist()
-      [0, 1, 0, 0, 1, 0]
+      >>> mixture.deal(6)
+      (array([0, 2, 3, 5]), array([1, 4]))
     """
 
     agents: tuple[Agent, ...]
@@ -113,8 +114,8 @@ class Mixture:
     def size(self) -> int:
         return len(self.agents)
 
-    def agent_of_candidate(self, population_size: int, antithetic: bool = False) -> np.ndarray:
-        """Index of the agent that trains on each candidate, `[pop]`.
+    def deal(self, population_size: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
+        """The candidates of each agent: their numbers in the population, ascending.
 
         One candidate after the other goes to the agent that is furthest behind its share; an agent
         of weight 0 gets none. Both candidates of an antithetic pair have the same agent, as they
@@ -123,22 +124,22 @@ class Mixture:
         Raises:
           ConfigError: if an agent with a weight gets no candidate.
         """
-        num_places = population_size // 2 if antithetic else population_size
+        num_dealt = population_size // 2 if antithetic else population_size
         shares = np.array(self.weights) / sum(self.weights)
-        counts = np.zeros(self.size)
-        dealt = []
-        for place in range(num_places):
-            agent = int(np.argmax(shares * (place + 1) - counts))
-            counts[agent] += 1
-            dealt.append(agent)
+        hands: list[list[int]] = [[] for _ in self.agents]
+        for candidate in range(num_dealt):
+            behind = shares * (candidate + 1) - [len(hand) for hand in hands]
+            hands[int(np.argmax(behind))].append(candidate)
         require(
-            counts[shares > 0].all(),
+            all(hand for hand, share in zip(hands, shares, strict=True) if share > 0),
             "es.population_size",
-            f"must leave each agent a candidate; got {num_places} perturbations for weights "
-            f"{shortened(self.weights)}. Set "
-            f"es.population_size={2 * max(num_places, self.size)}.",
+            f"must leave each agent a candidate; got {num_dealt} perturbations for weights "
+            f"{shortened(self.weights)}. Set es.population_size={2 * max(num_dealt, self.size)}.",
         )
-        return np.tile(dealt, 2 if antithetic else 1)
+        mirrored = (0, num_dealt) if antithetic else (0,)
+        return tuple(
+            np.array([i + first for first in mirrored for i in hand], int) for hand in hands
+        )
 
     def num_evals(self, num_incumbent_evals: int) -> int:
         """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
@@ -152,7 +153,7 @@ class Mixture:
     def comparable(
         self,
         scores: Float[Array, " pop"],
-        agent_of_candidate: np.ndarray,
+        candidates: Sequence[np.ndarray],
         incumbent_means: Float[Array, " agent"],
     ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of candidates with different agents in one unit, and the incumbent's.
@@ -161,7 +162,7 @@ class Mixture:
 
         Args:
           scores: of the candidates; not finite where training diverged, and then they stay so.
-          agent_of_candidate: index of the agent that trained on each.
+          candidates: of each agent, as from `deal`.
           incumbent_means: nan for an agent that no evaluation of the incumbent survived with; its
             candidates are then compared with their own mean.
         """
@@ -169,11 +170,11 @@ class Mixture:
             return scores, incumbent_means[0]
         compare = _ranks if self.config.compared_by == "rank" else _advantages
         compared = scores
-        for i in np.unique(agent_of_candidate):
-            places = np.flatnonzero(agent_of_candidate == i)
-            own = scores[places]
-            mean = jnp.where(jnp.isfinite(incumbent_means[i]), incumbent_means[i], finite_mean(own))
-            compared = compared.at[places].set(compare(own, mean))
+        for numbers, mean in zip(candidates, incumbent_means, strict=True):
+            if numbers.size:
+                of_agent = scores[numbers]
+                mean = jnp.where(jnp.isfinite(mean), mean, finite_mean(of_agent))
+                compared = compared.at[numbers].set(compare(of_agent, mean))
         return compared, jnp.float32(0)
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
-from sejax.evaluation import make_proxy_tester, make_recorder, make_tester
+from sejax.evaluation import make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import Options, counts, finite, not_negative, option, positive, require
 from sejax.proxies.exact import Layer
@@ -180,7 +180,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     )
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
     shape = task.action_dim, task.obs_dim + 1
-    play = make_proxy_tester(agent, task.env, 1)
+    play = make_tester(agent, task, 1)
     record_one = make_recorder(agent, task, 1)
     bonus = config.alive_bonus or 0.0
 
@@ -193,7 +193,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         key_error, key_play = jax.random.split(key)
         error = size * random_map(key_error, shape)
         policy = policy._replace(weights=policy.weights + error)
-        tests = play(key_play, policy, task.params.replace(max_steps_in_episode=limit))
+        tests = play(key_play, policy, params=task.params.replace(max_steps_in_episode=limit))
         return tests.returns[0], tests.num_steps[0]
 
     def error_size(policy: Policy) -> Array:

@@ -1,7 +1,6 @@
 """The real tasks: environments with the paper's step limits and solved thresholds.
 
-The tables `classic`, `gridworld` and `mujoco.tasks` say what each task is (a `TaskSpec`) and make
-it; they import neither JAX nor gymnax. The dynamics are in `dynamics` and `mujoco`.
+`classic`, `gridworld` and `mujoco.tasks` say what each task is (a `TaskSpec`) and make it.
 """
 
 from sejax.envs.base import Task, TaskConfig

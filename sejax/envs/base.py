@@ -6,15 +6,15 @@ import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
+
+import jax
+from jaxtyping import Array, PyTree
 
 from sejax import options
+from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import Space, TaskSpec
-
-if TYPE_CHECKING:
-    from jaxtyping import Array, PyTree
-
-    from sejax.envs.environment import Environment, EnvParams
+from sejax.envs.wrappers import as_vectors
 
 
 class TaskConfig(Protocol):
@@ -58,8 +58,8 @@ class Task(TaskSpec):
     """
 
     name: str
-    env: "Environment"
-    params: "EnvParams"
+    env: Environment
+    params: EnvParams
     origin: Mapping[str, object] | None
     observation: Space = field(init=False)  # of `env`, so that `dataclasses.replace` may change it
     action: Space = field(init=False)
@@ -68,16 +68,14 @@ class Task(TaskSpec):
         self,
         *,
         name: str,
-        env: "Environment",
-        params: "EnvParams | None" = None,
+        env: Environment,
+        params: EnvParams | None = None,
         solved_reward: float = math.inf,
         max_steps: int | None = None,
         info_keys: tuple[str, ...] = (),
         augmented_keys: tuple[str, ...] = (),
         origin: Mapping[str, object] | None = None,
     ):
-        from sejax.envs.wrappers import as_vectors  # imports JAX
-
         solved_reward = options.as_python(solved_reward)
         is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
         options.require(  # it may be traced
@@ -104,7 +102,7 @@ class Task(TaskSpec):
         vars(self).update(name=name, env=vectors, params=params, origin=origin)
 
     @classmethod
-    def of(cls, spec: TaskSpec, *, name: str, env: "Environment") -> "Task":
+    def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
         """The task of an environment that has the spec's spaces."""
         return cls(
             name=name,
@@ -116,7 +114,7 @@ class Task(TaskSpec):
         )
 
 
-def require_own_steps(env: "Environment") -> None:
+def require_own_steps(env: Environment) -> None:
     """Checks that an environment is no wrapper of gymnax's kind.
 
     Such a one changes `step`, and its `step_env` is that of the environment in it: what it does
@@ -135,8 +133,8 @@ def require_own_steps(env: "Environment") -> None:
 
 
 def _with_limit(
-    env: "Environment", params: "EnvParams | None", max_steps: int | None
-) -> "tuple[EnvParams, int]":
+    env: Environment, params: EnvParams | None, max_steps: int | None
+) -> tuple[EnvParams, int]:
     """Params that have the step limit, and the limit."""
     default = env.default_params
     params = default if params is None else params
@@ -166,15 +164,14 @@ def _one_error(name: str) -> Iterator[None]:
         ) from error
 
 
-def _check_step(env: "Environment", params: "EnvParams", name: str) -> None:
+def _check_step(env: Environment, params: EnvParams, name: str) -> None:
     """Traces a step, so that faults of an environment are met before an agent trains there.
 
     Raises:
       ConfigError: if it returns other shapes or dtypes than the spaces and `reset_env` have.
     """
-    import jax
 
-    def step(key: "Array") -> "PyTree":
+    def step(key: Array) -> PyTree:
         obs, state = env.reset_env(key, params)
         action = env.action_space(params).sample(key)
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
@@ -182,7 +179,7 @@ def _check_step(env: "Environment", params: "EnvParams", name: str) -> None:
         begin, after = {"obs": obs, "state": state}, {"obs": next_obs, "state": next_state}
         return begin, after, reward, terminated
 
-    def kinds(tree: "PyTree") -> dict[str, str]:
+    def kinds(tree: PyTree) -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}

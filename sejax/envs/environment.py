@@ -29,7 +29,7 @@ class EnvState:
 
 @struct.dataclass
 class EnvParams:
-    max_steps_in_episode: int = 1
+    max_steps_in_episode: Array | int = 1
 
 
 State = TypeVar("State", bound=EnvState)

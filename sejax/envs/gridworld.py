@@ -1,15 +1,24 @@
-"""The grid worlds. Their dynamics are `sejax.envs.dynamics.gridworld`.
+"""Grid worlds drawn as maps of characters, and the two of the paper.
 
-A map has a cell for each character: S the start, G a goal, O a hole, # a wall, a space for floor.
+Source: `docs/reference.md` 6.1 and 6.2.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool
+
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.spec import Discrete, TaskSpec
 from sejax.options import Options, finite, option
 
+CELLS = "S GO#"  # start, floor, goal, hole, wall
+MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 CLIFF_WALKING = (
     "            ",
     "            ",
@@ -20,6 +29,104 @@ ROOM_2X2 = (
     "S ",
     " G",
 )
+
+
+@struct.dataclass
+class GridState(EnvState):
+    """Where the agent is: `index` = row * number of columns + column, `[]` int32."""
+
+    index: Array
+
+
+@struct.dataclass
+class GridParams(EnvParams):
+    """Reward of a step, by the cell in which it ends; the defaults are the 2x2 room's."""
+
+    step_reward: float = -0.01
+    goal_reward: float = 1.0
+    hole_reward: float = -1.0
+    max_steps_in_episode: int = 10
+
+
+class GridWorld(Environment[GridState, GridParams]):
+    """A deterministic world of cells.
+
+    A move into a wall or off the map stays in place and is paid like the cell it stays in.
+    Entering the goal or a hole terminates. Observations are the cell's index, `[]` int32.
+
+    Example:
+      >>> env = GridWorld(["S ", " G"])
+      >>> obs, state = env.reset_env(None, env.default_params)
+      >>> obs, state, reward, terminated, info = env.step_env(None, state, 2, env.default_params)
+      >>> int(obs), round(float(reward), 2), bool(terminated)
+      (2, -0.01, False)
+    """
+
+    def __init__(self, rows: Sequence[str], params: GridParams | None = None):
+        """Reads a map.
+
+        Args:
+          rows: strings of equal length, of the characters `CELLS`: one S where episodes start,
+            G for goals, O for holes, # for walls and a space for floor.
+          params: `default_params`; those of `GridParams` if not given.
+
+        Raises:
+          ValueError: if the map is no rectangle of these characters with one S.
+        """
+        _check(rows)
+        cells = np.array([list(row) for row in rows])
+        self.spaces = Discrete(cells.size), Discrete(len(MOVES))
+        self._default_params = params or GridParams()
+        self._start = int(np.flatnonzero(cells == "S")[0])
+        self._goal = (cells == "G").ravel()  # [num_states]
+        self._hole = (cells == "O").ravel()  # [num_states]
+        self._next = _next_indices(cells)  # [num_states, 4]
+
+    def start(self, key: Array) -> GridState:
+        """Puts the agent on the map's S; the key has no effect."""
+        return GridState(index=jnp.int32(self._start), time=0)
+
+    def step_env(
+        self, key: Array, state: GridState, action: Array, params: GridParams
+    ) -> Step[GridState]:
+        """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
+        index = jnp.asarray(self._next)[state.index, action]
+        state = GridState(index=index, time=state.time + 1)
+        reward = jnp.where(
+            jnp.asarray(self._goal)[index],
+            params.goal_reward,
+            jnp.where(jnp.asarray(self._hole)[index], params.hole_reward, params.step_reward),
+        )
+        return self.after(state, reward, params)
+
+    def observe(self, state: GridState) -> Array:
+        return state.index
+
+    def is_terminated(self, state: GridState, params: GridParams) -> Bool[Array, ""]:
+        return jnp.asarray(self._goal | self._hole)[state.index]
+
+
+def _check(rows: Sequence[str]) -> None:
+    characters = "".join(rows)
+    for holds, must, got in (
+        (len({len(row) for row in rows}) == 1, "have one length", [len(row) for row in rows]),
+        ({*characters} <= {*CELLS}, f"consist of {list(CELLS)}", sorted({*characters} - {*CELLS})),
+        (characters.count("S") == 1, "have one S", characters.count("S")),
+    ):
+        if not holds:
+            raise ValueError(f"rows must {must}; got {got}")
+
+
+def _next_indices(cells: np.ndarray) -> np.ndarray:
+    """Index reached from each cell by each action, `[num_states, 4]` int32."""
+    padded = np.pad(cells, 1, constant_values="#")
+    index = np.arange(cells.size).reshape(cells.shape)
+    columns = []
+    for down, right in MOVES:
+        target = np.roll(padded, (-down, -right), (0, 1))[1:-1, 1:-1]
+        moved = index + down * cells.shape[1] + right
+        columns.append(np.where(target == "#", index, moved).ravel())
+    return np.stack(columns, axis=1).astype(np.int32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +149,6 @@ class CliffWalking(Options):
     )
 
     def make(self) -> Task:
-        from sejax.envs.dynamics.gridworld import GridParams, GridWorld
-
         params = GridParams(
             step_reward=-1.0,
             goal_reward=self.goal_reward,
@@ -65,7 +170,5 @@ class GridWorld2x2:
     )
 
     def make(self) -> Task:
-        from sejax.envs.dynamics.gridworld import GridParams, GridWorld
-
         params = GridParams(step_reward=-0.01, goal_reward=1.0, hole_reward=-1.0)
         return Task.of(self.spec, name="gridworld_2x2", env=GridWorld(ROOM_2X2, params))

@@ -1,12 +1,11 @@
-"""What is known of a task without making it: its spaces, limits and thresholds.
-
-Importing this imports neither JAX nor gymnax, so that bad settings are refused quickly.
-"""
+"""What is known of a task without making it: its spaces, limits and thresholds."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -147,8 +146,6 @@ class TaskSpec:
 
 def _plain(space: Space) -> dict[str, Any]:
     """A space of `TaskSpec.interface`, its bounds in single precision."""
-    import numpy as np
-
     if isinstance(space, Discrete):
         return {"n": space.n}
     bounds = {"low": space.low, "high": space.high}

@@ -1,14 +1,24 @@
-"""Environments around another one: each action repeated, or everything as vectors."""
+"""Environments around another one: actions repeated, partly scored, or all as vectors."""
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Float, PyTree
 
-from sejax.envs.environment import Environment, EnvParams, EnvState, Step, spaces_of
+from sejax.envs.environment import (
+    Environment,
+    EnvParams,
+    EnvState,
+    Params,
+    State,
+    Step,
+    spaces_of,
+)
 from sejax.envs.spec import Box, Discrete, Space
 from sejax.options import require, shortened
 
@@ -16,14 +26,14 @@ if TYPE_CHECKING:
     from gymnax.environments.spaces import Space as GymnaxSpace
 
 
-class Wrapper(Environment[EnvState, EnvParams]):
+class Wrapper(Environment[State, Params]):
     """An environment that is another one but for what a subclass changes."""
 
     def __init__(self, env: Environment):
         self.env = env
 
     @property
-    def default_params(self) -> EnvParams:
+    def default_params(self) -> Params:
         return self.env.default_params
 
     @property
@@ -34,33 +44,31 @@ class Wrapper(Environment[EnvState, EnvParams]):
     def num_actions(self) -> int:
         return self.env.num_actions
 
-    def reset_env(self, key: Array, params: EnvParams) -> tuple[Array, EnvState]:
+    def reset_env(self, key: Array, params: Params) -> tuple[Array, State]:
         return self.env.reset_env(key, params)
 
-    def step_env(
-        self, key: Array, state: EnvState, action: Array, params: EnvParams
-    ) -> Step[EnvState]:
+    def step_env(self, key: Array, state: State, action: Array, params: Params) -> Step[State]:
         return self.env.step_env(key, state, action, params)
 
     def get_obs(
-        self, state: EnvState, params: EnvParams | None = None, key: Array | None = None
+        self, state: State, params: Params | None = None, key: Array | None = None
     ) -> Array:
         return self.env.get_obs(state, params, key)
 
-    def is_truncated(self, state: EnvState, params: EnvParams) -> Array:
+    def is_truncated(self, state: State, params: Params) -> Array:
         return self.env.is_truncated(state, params)
 
-    def is_terminated(self, state: EnvState, params: EnvParams) -> Array:
+    def is_terminated(self, state: State, params: Params) -> Array:
         return self.env.is_terminated(state, params)
 
-    def action_space(self, params: EnvParams | None = None) -> "GymnaxSpace":
+    def action_space(self, params: Params | None = None) -> "GymnaxSpace":
         return super().action_space() if self.spaces else self.env.action_space(params)
 
-    def observation_space(self, params: EnvParams | None = None) -> "GymnaxSpace":
+    def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
         return super().observation_space() if self.spaces else self.env.observation_space(params)
 
 
-class ActionRepeat(Wrapper):
+class ActionRepeat(Wrapper[EnvState, EnvParams]):
     """An environment in which each decision lasts `num_repeats` steps, or to the episode's end.
 
     Rewards add up undiscounted, and `info["num_steps"]` says how many steps were made. State,
@@ -103,7 +111,61 @@ def repeat_actions(env: Environment, num_repeats: int) -> Environment:
     return env if num_repeats == 1 else ActionRepeat(env, num_repeats)
 
 
-class AsVectors(Wrapper):
+@struct.dataclass
+class PartState(EnvState):
+    world: EnvState  # the wrapped environment's
+
+
+@struct.dataclass
+class PartParams(EnvParams):
+    scored_steps: Array | int = 1  # may exceed the task's step limit
+
+
+class PartlyScored(Wrapper[PartState, PartParams]):
+    """An environment of which the first steps of an episode are scored, or more than all.
+
+    Rewards are those within the task's step limit, where a repeated action ends too;
+    `info["scored_reward"]` is the reward of a decision that begins within the scored steps, and 0
+    after them. An episode lasts to the later of both limits.
+
+    Args:
+      env: the environment.
+      params: its own; those of this one are `PartParams`.
+    """
+
+    def __init__(self, env: Environment, params: EnvParams):
+        super().__init__(env)
+        self.params = params
+
+    def reset_env(self, key: Array, params: PartParams) -> tuple[Array, PartState]:
+        obs, world = self.env.reset_env(key, self.params)
+        return obs, PartState(time=jnp.int32(0), world=world)
+
+    def step_env(
+        self, key: Array, state: PartState, action: Array, params: PartParams
+    ) -> Step[PartState]:
+        limit = self.params.max_steps_in_episode
+        is_within = state.time < limit
+        until = jnp.where(is_within, limit, self._longest(params))
+        obs, world, reward, terminated, info = self.env.step_env(
+            key, state.world, action, self._with_limit(until)
+        )
+        scored = jnp.where(state.time < params.scored_steps, reward, 0.0)
+        state = PartState(time=state.time + info.get("num_steps", 1), world=world)
+        reward = jnp.where(is_within, reward, 0.0)
+        return obs, state, reward, terminated, {**info, "scored_reward": scored}
+
+    def is_truncated(self, state: PartState, params: PartParams) -> Array:
+        return self.env.is_truncated(state.world, self._with_limit(self._longest(params)))
+
+    def _longest(self, params: PartParams) -> Array:
+        return jnp.maximum(self.params.max_steps_in_episode, params.scored_steps)
+
+    def _with_limit(self, steps: Array) -> EnvParams:
+        return dataclasses.replace(self.params, max_steps_in_episode=steps)
+
+
+class AsVectors(Wrapper[EnvState, EnvParams]):
     """An environment with float32 vectors as observations and continuous actions in [-1, 1].
 
     Observations of any shape are flattened, row by row; an action `[n]` is scaled linearly to the

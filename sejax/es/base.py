@@ -2,19 +2,33 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
+from sejax.ops.scores import finite_mean
 from sejax.options import MOST_MEMBERS, Options, counts, one_of, option
 
-AGGREGATES = ("mean", "min")
 MAX_SCALE = 1e6  # larger steps or noise lead to weights whose products are not finite
-_TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
+T = TypeVar("T")
 StrategyState: TypeAlias = PyTree  # only the strategy reads it
+
+
+class Groups(NamedTuple, Generic[T]):
+    """What belongs to the two groups of trainings in a generation.
+
+    Attributes:
+      population: of each candidate's evaluations; arrays are `[pop, evaluation, ...]`.
+      incumbent: of the incumbent's evaluations, in each turn one with each agent of a mixture;
+        arrays are `[turn, agent, ...]`.
+    """
+
+    population: T
+    incumbent: T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,46 +47,34 @@ class Evaluations:
     num_incumbent_evals: int = 16
     common_random_numbers: bool = False
 
-    def seed_ids(self, population_size: int) -> np.ndarray:
-        """Numbers of the evaluations, `[evaluation]`; those with equal numbers share a seed.
+    def keys(self, key: Array, population_size: int, num_agents: int = 1) -> Groups[Array]:
+        """A key for each training of a generation.
 
-        The evaluations of a candidate follow one another; those of the incumbent come last.
+        Args:
+          key: of the generation.
+          population_size: candidates in the population.
+          num_agents: agents that take turns on the incumbent; a divisor of `num_incumbent_evals`.
         """
-        num_evaluations = population_size * self.num_evals
-        if not self.common_random_numbers:
-            return np.arange(num_evaluations + self.num_incumbent_evals)
-        of_population = np.arange(num_evaluations) % self.num_evals
-        return np.concatenate([of_population, np.arange(self.num_incumbent_evals)])
+        of_population = np.arange(population_size * self.num_evals)
+        of_incumbent = np.arange(self.num_incumbent_evals)
+        if self.common_random_numbers:
+            of_population = of_population % self.num_evals
+        else:
+            of_incumbent = of_incumbent + of_population.size
+        fold_in = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (None, 0))
+        return Groups(
+            population=fold_in(key, of_population.reshape(population_size, self.num_evals)),
+            incumbent=fold_in(key, of_incumbent.reshape(-1, num_agents)),
+        )
 
-    def agents(self, agent_of_candidate: np.ndarray, num_agents: int) -> np.ndarray:
-        """Index of the agent in each evaluation, `[evaluation]`; the incumbent's take turns."""
-        of_incumbent = np.arange(self.num_incumbent_evals) % num_agents
-        return np.concatenate([np.repeat(agent_of_candidate, self.num_evals), of_incumbent])
-
-    def params(
-        self, population: Float[Array, "pop dims"], incumbent: Float[Array, " dims"]
-    ) -> Float[Array, "evaluation dims"]:
-        """The vector of each evaluation, in the order of `seed_ids`."""
-        repeated = jnp.repeat(population, self.num_evals, axis=0)
-        shape = (self.num_incumbent_evals, incumbent.shape[0])
-        return jnp.concatenate([repeated, jnp.broadcast_to(incumbent, shape)])
-
-    def split(
-        self, scores: Float[Array, " evaluation"]
-    ) -> tuple[Float[Array, " of_population"], Float[Array, " of_incumbent"]]:
-        """Scores of the population's evaluations, and of the incumbent's."""
-        num_evaluations = scores.shape[0] - self.num_incumbent_evals
-        return scores[:num_evaluations], scores[num_evaluations:]
-
-    def population_scores(self, scores: Float[Array, " of_population"]) -> Float[Array, " pop"]:
+    def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
         """A score for each candidate; not finite if that of an evaluation is not."""
-        scores = scores.reshape(-1, self.num_evals)
         scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 
     def incumbent_scores(
-        self, scores: Float[Array, " of_incumbent"], population: Float[Array, " of_population"]
-    ) -> tuple[Float[Array, " of_incumbent"], Float[Array, ""]]:
+        self, scores: Float[Array, " turn"], population: Float[Array, " evaluation"]
+    ) -> tuple[Float[Array, " turn"], Float[Array, ""]]:
         """The incumbent's scores, with agents that diverged ranked last, and their mean.
 
         Agents that diverged get the lowest finite score of the generation: a mean without them
@@ -130,7 +132,9 @@ class StrategyOptions(Options):
         help="n_p: perturbations in a generation",
     )
     num_evals: int = option(1, counts("a candidate needs a score"), help="agents on each candidate")
-    eval_aggregate: str = option("mean", one_of(AGGREGATES), help="how their scores become one")
+    eval_aggregate: str = option(
+        "mean", one_of(("mean", "min")), help="how their scores become one"
+    )
     common_random_numbers: bool = option(
         False, help="the same inner seeds for all candidates of a generation"
     )
@@ -143,18 +147,3 @@ class StrategyOptions(Options):
             num_incumbent_evals=num_incumbent_evals,
             common_random_numbers=self.common_random_numbers,
         )
-
-
-def is_tie(scores: Float[Array, "*n"], incumbent: Float[Array, ""]) -> Bool[Array, "*n"]:
-    """Whether scores are the incumbent's but for rounding.
-
-    In single precision the mean of equal scores may be a few last digits off, whose share of each
-    other would be weights as large as any. The authors' code asks for a difference of 1e-6.
-    """
-    return jnp.abs(scores - incumbent) <= _TIE * jnp.maximum(1.0, jnp.abs(incumbent))
-
-
-def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
-    """Mean of the finite scores; nan if there is none."""
-    finite = jnp.isfinite(scores)
-    return jnp.where(finite, scores, 0.0).sum() / finite.sum()

@@ -126,7 +126,7 @@ def from_evosax(
     *,
     antithetic: bool = False,
     remembers_scores: bool = False,
-    evaluations: Evaluations = Evaluations(),  # noqa: B008 (frozen)
+    evaluations: Evaluations = Evaluations(),
 ) -> Strategy:
     """A strategy of an algorithm of evosax, whose mean is the incumbent.
 

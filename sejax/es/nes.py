@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from sejax.es.base import MAX_SCALE, Strategy, StrategyOptions
 from sejax.es.score_transforms import OwnTransform, require_transform, transform_of
+from sejax.ops.scores import or_lowest
 from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
@@ -146,7 +147,6 @@ def better_signs(
 ) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
     """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
-    rank_minus, rank_plus = (jnp.where(jnp.isfinite(x), x, -jnp.inf) for x in (minus, plus))
-    use_minus = rank_minus > rank_plus
+    use_minus = or_lowest(minus) > or_lowest(plus)
     sign = jnp.where(use_minus, -1.0, 1.0)
     return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.es.base import is_tie
+from sejax.ops.scores import is_tie
 from sejax.options import ConfigError, registry, require, told, unknown_name
 
 FIELD = "es.score_transform"

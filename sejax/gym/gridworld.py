@@ -17,7 +17,7 @@ MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (ro
 
 
 class GridWorld(gymnasium.Env[int, int]):
-    """A deterministic world of cells, `sejax.envs.dynamics.gridworld` step by step.
+    """A deterministic world of cells, `sejax.envs.gridworld` step by step.
 
     Observations are the cell's index, row * number of columns + column. Actions are 0 RIGHT, 1
     LEFT, 2 DOWN, 3 UP. Entering the goal or a hole (the cliff) terminates; a move off the map stays

@@ -18,8 +18,8 @@ from sejax.gym.gridworld import Info
 from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, space_of
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.configs import RewardConfig
 from sejax.proxies.header import check_tensors, read
+from sejax.proxies.reward import RewardConfig
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
 GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise

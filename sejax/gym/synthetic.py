@@ -15,8 +15,8 @@ from sejax.gym.gridworld import Info
 from sejax.gym.tasks import RealTask
 from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import check_tensors
+from sejax.proxies.synthetic import SyntheticConfig
 
 Numbers = np.ndarray | float
 

@@ -131,8 +131,8 @@ GROUPS = {
         "sejax.proxies.base:ProxyEnv",
         ("task",),
         {
-            "se": "sejax.proxies.configs:SyntheticConfig",
-            "rn": "sejax.proxies.configs:RewardConfig",
+            "se": "sejax.proxies.synthetic:SyntheticConfig",
+            "rn": "sejax.proxies.reward:RewardConfig",
         },
         base="sejax.proxies:ProxyConfig",
     ),

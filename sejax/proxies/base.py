@@ -6,11 +6,10 @@ it as in any other environment. What the inner loop must know beside that is tol
 """
 
 import copy
-import functools
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 from flax import struct
@@ -19,9 +18,65 @@ from jaxtyping import Array, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
-from sejax.options import ConfigError, require
-from sejax.proxies import ProxyConfig
-from sejax.proxies.header import Header
+from sejax.options import Options, require
+
+# A reward or an entry of a state that networks make ends the episode beyond this; what is the real
+# task's own may be larger. It is far outside what networks of sane weights make, and small enough
+# for its square to stay finite in float32.
+MAX_ABS_VALUE = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProxyConfig(Options, ABC):
+    """What a proxy's configuration declares; configurations of your own derive from it.
+
+    Attributes:
+      default_objective: name of the objective that `python -m sejax.run proxy=...` takes.
+      has_real_dynamics: whether agents step the real task. Their steps then count as real ones, and
+        the task's step limit is one that agents may treat as terminal.
+    """
+
+    group: ClassVar[str] = "proxy"
+    default_objective: ClassVar[str] = "max_reward"
+    has_real_dynamics: ClassVar[bool] = False
+
+    @property
+    def needs_task(self) -> bool:
+        """Whether the real task must run where the proxy is used.
+
+        If not, the spaces and the step limit in a proxy's file are enough to load it.
+        """
+        return True
+
+    @property
+    def needs_discount(self) -> bool:
+        """Whether rewards depend on the agent's discount, which a file must then hold."""
+        return False
+
+    @property
+    def sees_bounds(self) -> bool:
+        """Whether the bounds of the task's observations are part of the proxy."""
+        return False
+
+    @property
+    def reaches_step_limit(self) -> bool:
+        """Whether episodes of nearly all proxies of this kind last to their step limit."""
+        return False
+
+    def max_steps(self, task_max_steps: int) -> int:
+        """Maximum number of steps of an episode, given the real task's."""
+        return task_max_steps
+
+    def require_task(self, spec: TaskSpec, task_name: str) -> None:
+        """Checks that a proxy of this kind is possible for a task.
+
+        Raises:
+          ConfigError: if it is not.
+        """
+
+    @abstractmethod
+    def make(self, task: Task) -> "ProxyEnv":
+        """The proxy of a task."""
 
 
 @struct.dataclass
@@ -141,62 +196,3 @@ def prepare(
     if not isinstance(env, ProxyEnv):
         return params
     return env.prepare(params, discount, limit_is_terminal)
-
-
-# --- a task that cannot be made here --------------------------------------------------------------
-
-
-class AbsentEnv(Environment):
-    """The spaces of a task that cannot be made here, for an SE that needs no more of it.
-
-    Such an SE can be loaded without the package that its task needs, or on a device that the task
-    does not run on. `reset_env` and `step_env` raise the reason as a `ConfigError`.
-    """
-
-    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
-        super().__init__(spec)
-        self._task_name, self._reason = task_name, reason
-
-    def fail(self) -> NoReturn:
-        """Raises the reason as a `ConfigError`."""
-        raise ConfigError(self._reason, "task")
-
-    def reset_env(self, key: Array, params: PyTree) -> NoReturn:
-        self.fail()
-
-    def step_env(self, key: Array, state: PyTree, action: Array, params: PyTree) -> NoReturn:
-        self.fail()
-
-    @property
-    def name(self) -> str:
-        return self._task_name
-
-
-def absent_task(header: Header, reason: str) -> Task:
-    """A task of which no more is known than what a proxy's file says; built once.
-
-    Args:
-      header: of the file.
-      reason: why the task itself cannot be made.
-    """
-    known = json.dumps([header.interface, header.config["env"]], sort_keys=True)
-    return _absent_task(header.task, known, reason)
-
-
-@functools.cache
-def _absent_task(name: str, known: str, reason: str) -> Task:
-    interface, origin = json.loads(known)
-    spec = TaskSpec.of_interface(interface)
-    env = AbsentEnv(name, spec, reason)
-    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
-
-
-def require_present(task: Task) -> Task:
-    """The task, if it can be run.
-
-    Raises:
-      ConfigError: for one of `absent_task`: why it cannot.
-    """
-    if isinstance(task.env, AbsentEnv):
-        task.env.fail()
-    return task

@@ -24,7 +24,7 @@ import numpy as np
 from sejax.envs.base import Task
 from sejax.options import positive, require
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.configs import START_HIDDEN_SIZE, SyntheticConfig
+from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig
 
 Layer = tuple[np.ndarray, np.ndarray]  # kernel [out, in] and bias [out] of an affine map
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 
 from sejax import envs
 from sejax.agents import Agent, make_agent
+from sejax.agents.base import AgentConfig
 from sejax.envs.base import Task
 from sejax.ops.files import write_bytes
 from sejax.options import (
@@ -26,9 +27,12 @@ from sejax.options import (
     told,
     unknown_name,
 )
+from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
-from sejax.proxies.base import ProxyEnv, absent_task, require_present
+from sejax.proxies.absent import absent_task, require_present
+from sejax.proxies.base import ProxyEnv
 from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
+from sejax.training import TrainingConfig
 
 NONE = {"name": "none"}  # the exploration where a file tells none
 
@@ -224,6 +228,78 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
     agent = header.configured("agent", stored[name], env.name)
     exploration = header.configured("exploration", config.get("exploration", NONE), env.name)
     return make_agent(agent, env.task, exploration)
+
+
+def training_of(
+    proxy: ProxyEnv | Proxy | ProxySet, agent: AgentConfig | None = None
+) -> TrainingConfig:
+    """How long agents trained on a stored proxy when it was learned.
+
+    Args:
+      proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
+      agent: configuration of another agent that is to train on it, whose budget is then that of
+        `budget_for`; None for the training as it was.
+
+    Raises:
+      ConfigError: for a proxy that is not stored, or if its file does not tell it.
+
+    Example:
+      >>> import sejax
+      >>> training_of(sejax.load_proxy("cartpole")).stop_rule
+      'never'
+    """
+    env, config = stored_env(proxy)
+    stored: Any = config.get("training")
+    require(
+        isinstance(stored, Mapping),
+        "training",
+        f"must be given for {shortened(env.name)}, which does not say how long its agents "
+        "trained; got none. Set training=sejax.TrainingConfig(...).",
+    )
+    training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
+    if agent is None:
+        return training
+    known = [
+        registry.configure("agent", values)
+        for values in agents_of(config).values()
+        if header.is_registered("agent", values)
+    ]
+    return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
+
+
+def budget_for(
+    training: TrainingConfig,
+    agent: AgentConfig,
+    learned_with: Iterable[AgentConfig],
+    max_episode_steps: int,
+    task_max_steps: int,
+) -> TrainingConfig:
+    """How long an agent trains on a proxy that was learned with others.
+
+    A step budget grows by the steps for which this agent waits longer with learning than any of
+    those: ten long initial episodes, or a rollout of PPO, could use it up. Episodes, which may have
+    one step, grow in number with it. No more steps are asked for than there were episodes for.
+
+    Args:
+      training: that the proxy was learned with.
+      agent: configuration of the agent that is to train.
+      learned_with: of those that the proxy was learned with, as far as they are known.
+      max_episode_steps: that the proxy's episodes may take.
+      task_max_steps: that the real task's may take.
+    """
+    max_steps = training.max_steps
+    if max_steps is None:
+        return training
+    if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
+        max_steps = min(max_steps, training.max_episodes * max_episode_steps)
+    waits, *waited = (
+        each.steps_before_learning(max_episode_steps, task_max_steps)
+        for each in (agent, *learned_with)
+    )
+    longer = max(0, waits - max(waited, default=0))
+    return dataclasses.replace(
+        training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
+    )
 
 
 # --- writing --------------------------------------------------------------------------------------

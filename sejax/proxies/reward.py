@@ -6,7 +6,8 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,121 @@ from jaxtyping import Array, Float, PyTree
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
+from sejax.envs.spec import TaskSpec
 from sejax.ops.networks import MLP, uniform_fan_in
-from sejax.options import require
-from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.base import ProxyEnv
+from sejax.options import (
+    ACTIVATIONS,
+    MOST_LAYERS,
+    as_text,
+    counts,
+    one_of,
+    option,
+    positive,
+    require,
+    shortened,
+)
+from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv
 
-if TYPE_CHECKING:  # whose `make` imports this
-    from sejax.proxies.configs import RewardConfig
+
+class Shaping(NamedTuple):
+    r"""How a reward network makes a reward: a row of the paper's table of variants.
+
+    Attributes:
+      is_additive: whether the real reward r is added.
+      is_potential_based: whether a step is worth :math:`\gamma \Phi(s') - \Phi(s)`, and not
+        :math:`\Phi(s')`.
+      weighs_info: whether there is no network, but a weight for each number i' in the step's `info`
+        (`Task.info_keys`).
+    """
+
+    is_additive: bool
+    is_potential_based: bool = False
+    weighs_info: bool = False
+
+
+# Source: paper, table "Overview of Reward Network variants".
+VARIANTS = {
+    "additive_potential": Shaping(is_additive=True, is_potential_based=True),
+    "exclusive_potential": Shaping(is_additive=False, is_potential_based=True),
+    "additive_non_potential": Shaping(is_additive=True),
+    "exclusive_non_potential": Shaping(is_additive=False),
+    "additive_weighted_info": Shaping(is_additive=True, weighs_info=True),
+    "exclusive_weighted_info": Shaping(is_additive=False, weighs_info=True),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig(ProxyConfig):
+    """The RN's network, and how its output makes a reward."""
+
+    default_objective: ClassVar[str] = "reward_threshold"
+    has_real_dynamics: ClassVar[bool] = True
+
+    hidden_size: int = option(64, counts("a layer needs a unit"))
+    num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
+    activation: str = option("prelu", one_of(ACTIVATIONS))
+    variant: str = option("additive_potential", one_of(VARIANTS))
+    output_scale: float = option(
+        1.0,
+        positive("a reward of 0 teaches nothing", 1e6),
+        help=(
+            "Phi is this times the network's output. Some agents learn only from small rewards "
+            "(docs/results.md, MountainCarContinuous)."
+        ),
+    )
+    augmented: bool = option(False, help="the network sees the task's vector v as well")
+    zero_at_terminal: bool = option(
+        False, help="Phi is 0 where episodes end for the agent; see RewardEnv"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
+        for name, default in defaults.items():
+            value = getattr(self, name)
+            require(
+                value == default or not self.shaping.weighs_info,
+                f"proxy.{name}",
+                f"must be {as_text(default)}, as {self.variant} has no network; got "
+                f"{shortened(value)}. Set proxy.{name}={as_text(default)}.",
+            )
+
+    @property
+    def shaping(self) -> Shaping:
+        """How the network's output makes a reward."""
+        return VARIANTS[self.variant]
+
+    @property
+    def needs_discount(self) -> bool:
+        return self.shaping.is_potential_based
+
+    def require_task(self, spec: TaskSpec, task_name: str) -> None:
+        """Checks that the steps of the task tell what this variant needs.
+
+        Raises:
+          ConfigError: if they do not.
+        """
+        fields = (
+            ("variant", self.shaping.weighs_info, spec.info_keys, "additive_potential"),
+            ("augmented", self.augmented, spec.augmented_keys, "false"),
+        )
+        for name, is_needed, is_there, fix in fields:
+            value = getattr(self, name)
+            require(
+                is_there or not is_needed,
+                f"proxy.{name}",
+                f"must do without a step's info in {shortened(task_name)}, which tells nothing of "
+                f"the state; got {value}. Set proxy.{name}={fix}.",
+            )
+
+    def make(self, task: Task) -> "RewardEnv":
+        """The RN of a task.
+
+        Raises:
+          ConfigError: if the task does not tell what this variant needs.
+        """
+        self.require_task(task, task.name)
+        return RewardEnv(task, self)
 
 
 @struct.dataclass
@@ -79,9 +188,9 @@ class RewardEnv(ProxyEnv):
     finite.
     """
 
-    config: "RewardConfig"
+    config: RewardConfig
 
-    def __init__(self, task: Task, config: "RewardConfig"):
+    def __init__(self, task: Task, config: RewardConfig):
         super().__init__(task, config)
         self._augmented_keys = task.augmented_keys if config.augmented else ()
         self._net = MLP(1, config.hidden_size, config.num_layers, config.activation)

@@ -15,7 +15,7 @@ import yaml
 from sejax.options import registry
 from sejax.options.plain import from_plain
 from sejax.proxies import header, hub
-from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig
 
 CARD = Path(__file__).with_name("card.md")
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."

@@ -116,7 +116,7 @@ class LearnConfig(CommandConfig):
         *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
     )
 
-    weights: tuple[float, ...] = ()  # of the agents; equal if not given
+    weights: tuple[float, ...] = option((), help="of the agents; equal if not given")
     mixture: MixtureConfig = option(MixtureConfig())
     preset: str = option("best", help="settings that were measured (best) or published (paper)")
     env: Any = option(help="the real task")

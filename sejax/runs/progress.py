@@ -149,8 +149,8 @@ class RunProgress(Reporter):
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
         title, verdict = "learned", f"best incumbent score {self._score(best)}"
-        if learner.objective.meaning:
-            verdict += f": {learner.objective.meaning}"
+        if learner.scoring.objective.meaning:
+            verdict += f": {learner.scoring.objective.meaning}"
         if learner.solved_score is not None:
             solved = "solved" if best >= learner.solved_score else "not solved"
             title = "solved" if solved == "solved" else title

@@ -28,8 +28,8 @@ if TYPE_CHECKING:  # which import jax
     from jax.tree_util import KeyPath
     from jaxtyping import PyTree
 
-    from sejax.objectives import GenerationInfo
     from sejax.runs.config import LearnConfig
+    from sejax.scoring import GenerationInfo
 
 COLUMNS = (
     "generation",

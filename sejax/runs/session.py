@@ -16,13 +16,13 @@ import numpy as np
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.objectives import GenerationInfo
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 from sejax.runs import next_steps, plots, runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
 PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
@@ -245,7 +245,7 @@ class _Proxies:
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
         self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
-        agent = learner.mixture.agents[0]
+        agent = learner.scoring.mixture.agents[0]
         discount = agent.discount(agent.hparams)
         self._discount = None if discount is None else float(discount)
         self._best: int | None = None  # the generation of the best proxy that is on the disk
@@ -268,7 +268,7 @@ class _Proxies:
     def _save(self, name: str, flat: Array, score: Array, scores: Array, generation: Array) -> None:
         if not np.isfinite(flat).all():  # the mean has diverged; the file before it stays
             return
-        names = self._learner.mixture.names
+        names = self._learner.scoring.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
             self._directory.path / f"{name}.safetensors",

@@ -10,6 +10,7 @@ Shares shrink towards the end of a generation (guided self-scheduling, Polychron
 """
 
 import contextlib
+import dataclasses
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,10 +27,11 @@ if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its dev
     from jax import Array
 
     from sejax.bilevel import Bilevel, LearnState
-    from sejax.evaluation import Candidates, Evaluator
-    from sejax.objectives import GenerationInfo, Outcome
+    from sejax.generation import Candidates, Trainings
+    from sejax.objectives import Outcome
     from sejax.runs.config import LearnConfig
     from sejax.runs.session import Chunks
+    from sejax.scoring import GenerationInfo
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -140,12 +142,12 @@ def batches_of(
     round otherwise. A worker with a GPU computes its part of a generation at once.
     """
     batches = []
-    for evaluator, places in zip(learner.evaluators, _places(learner), strict=True):
+    for cpu_width, size in zip(learner.evaluate.widths, learner.evaluate.sizes, strict=True):
         if machines.gpus_per_worker:
-            capacity, width = -(-len(places) // num_first), config.num_parallel
+            capacity, width = -(-size // num_first), config.num_parallel
         else:
             capacity = CAPACITY
-            width = config.num_parallel or evaluator.cpu_num_parallel
+            width = config.num_parallel or cpu_width
         width = width or capacity
         batches.append(Batch(width * -(-capacity // width), width))
     return batches
@@ -160,24 +162,17 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
         places = places[size:]
 
 
-def _places(learner: "Bilevel") -> list[np.ndarray]:
-    """The indices of each evaluator's evaluations in a generation."""
-    evaluators = learner.scoring.agent_of_evaluation
-    return [np.flatnonzero(evaluators == i) for i in range(len(learner.evaluators))]
-
-
 @dataclass(frozen=True)
 class Share:
-    """Evaluations of one evaluator.
+    """Trainings of one agent.
 
     Attributes:
-      evaluator: its index.
-      arguments: data of their keys `[n, ...]`, candidates `[n, dims]`, whether anything is computed
-        `[n]`, and the length of the test episodes that are scored, `[n]` or None.
+      agent: its index.
+      trainings: leaves `[n, ...]` of NumPy, the keys as data.
     """
 
-    evaluator: int
-    arguments: tuple[Any, ...]
+    agent: int
+    trainings: "Trainings"
 
 
 class RemoteChunks:
@@ -194,7 +189,6 @@ class RemoteChunks:
     def __init__(self, learner: "Bilevel", pool: Pool, batches: Sequence[Batch]):
         self.learner, self.cpu_s = learner, 0.0
         self._pool, self._batches = pool, batches
-        self._places = _places(learner)
         self._compiled: Any = None
 
     def init(self, key: "Array") -> "LearnState":
@@ -219,19 +213,21 @@ class RemoteChunks:
 
         from sejax.ops.parallel import compiler_options
 
-        def generation(state: "LearnState", outcome: "Outcome") -> tuple[Any, ...]:
-            asked = self.learner.ask(state)
-            return self.learner.tell(state, asked, outcome), _arguments(asked)
+        def generation(state: "LearnState", by_agent: list["Outcome"]) -> tuple[Any, ...]:
+            candidates = self.learner.ask(state)
+            outcomes = self.learner.evaluate.outcomes(by_agent)
+            return self.learner.tell(state, candidates, outcomes), _sent(self.learner, candidates)
 
-        def evaluate(key: "Array") -> "Outcome":
-            return self.learner.evaluate(self.learner.ask(self.learner.init(key)))
+        def no_outcomes(state: "LearnState") -> list["Outcome"]:
+            trainings = self.learner.evaluate.trainings(self.learner.ask(state))
+            pairs = zip(self.learner.evaluate.runs, trainings, strict=True)
+            return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
 
-        key = jax.random.key(0)
-        shapes = jax.eval_shape(evaluate, key)
-        self._no_outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        state = jax.eval_shape(self.learner.init, jax.random.key(0))
+        shapes = jax.eval_shape(no_outcomes, state)
+        self._no_outcomes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        state = jax.eval_shape(self.learner.init, key)
-        self._compiled = jitted.lower(state, self._no_outcome).compile()
+        self._compiled = jitted.lower(state, self._no_outcomes).compile()
 
     def advance(self, state: "LearnState", length: int) -> tuple["LearnState", "GenerationInfo"]:
         """Runs `length` generations.
@@ -249,40 +245,44 @@ class RemoteChunks:
             self.compile(length)
         infos = []
         for _ in range(length):
-            _, arguments = self._compiled(state, self._no_outcome)
-            outcome = self._evaluate(jax.device_get(arguments))
-            (state, info), _ = self._compiled(state, outcome)
+            _, trainings = self._compiled(state, self._no_outcomes)
+            by_agent = self._evaluate(jax.device_get(trainings))
+            (state, info), _ = self._compiled(state, by_agent)
             infos.append(info)
         return state, jax.tree.map(lambda *each: jnp.stack(each), *infos)
 
-    def _evaluate(self, arguments: tuple[Any, ...]) -> "Outcome":
-        """The outcome of a generation, leaves `[evaluation, ...]`."""
+    def _evaluate(self, by_agent: Sequence["Trainings"]) -> list["Outcome"]:
+        """The outcomes of each agent's trainings, leaves `[training, ...]`."""
         import jax
 
-        places, shares = [], []
-        for evaluator, (own, batch) in enumerate(zip(self._places, self._batches, strict=True)):
-            for some in cut(own, batch, max(1, self._pool.size)):
-                places.append(some)
-                shares.append(Share(evaluator, _at(arguments, some)))
+        shares = [
+            Share(agent, jax.tree.map(lambda x, places=places: x[places], trainings))
+            for agent, (trainings, batch) in enumerate(zip(by_agent, self._batches, strict=True))
+            for places in cut(np.arange(len(trainings.active)), batch, max(1, self._pool.size))
+        ]
         outcomes, cpu_s = zip(*self._pool.map(shares), strict=True)
         self.cpu_s += sum(cpu_s)
-        order = np.argsort(np.concatenate(places))
-        merged: Outcome = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *outcomes)
-        return merged
+        return [
+            jax.tree.map(
+                lambda *parts: np.concatenate(parts),
+                *(
+                    outcome
+                    for share, outcome in zip(shares, outcomes, strict=True)
+                    if share.agent == agent
+                ),
+            )
+            for agent in range(len(by_agent))
+        ]
 
 
-def _arguments(asked: "Candidates") -> tuple[Any, ...]:
-    """What a generation's trainings need, leaves `[evaluation, ...]`; see `Share`."""
+def _sent(learner: "Bilevel", candidates: "Candidates") -> list["Trainings"]:
+    """The trainings of each agent, with keys as data."""
     import jax
-    import jax.numpy as jnp
 
-    shared = asked.active, asked.eval_steps
-    of_each = jax.tree.map(lambda x: jnp.repeat(x, len(asked.params)), shared)
-    return jax.random.key_data(asked.keys), asked.params, *of_each
-
-
-def _at(arguments: tuple[Any, ...], places: np.ndarray) -> tuple[Any, ...]:
-    return tuple(x if x is None else x[places] for x in arguments)
+    return [
+        dataclasses.replace(trainings, key=jax.random.key_data(trainings.key))
+        for trainings in learner.evaluate.trainings(candidates)
+    ]
 
 
 # --- a worker -------------------------------------------------------------------------------------
@@ -325,8 +325,8 @@ class Worker:
         learner = make_bilevel(**of_run.parts() | {"devices": 1})
         self._capacities = capacities
         self._programs = [
-            _compiled_share(learner, evaluator, capacity, of_run.num_parallel)
-            for evaluator, capacity in zip(learner.evaluators, capacities, strict=True)
+            _compiled_share(learner, agent, capacity, of_run.num_parallel)
+            for agent, capacity in enumerate(capacities)
         ]
 
     def ready(self) -> None:
@@ -337,34 +337,31 @@ class Worker:
         import jax
 
         started = time.process_time()
-        n, capacity = len(share.arguments[0]), self._capacities[share.evaluator]
+        n, capacity = len(share.trainings.active), self._capacities[share.agent]
         # Filled up with copies, for which nothing is computed.
-        places, is_own = np.minimum(np.arange(capacity), n - 1), np.arange(capacity) < n
-        keys, params, active, eval_steps = _at(share.arguments, places)
-        outcome = self._programs[share.evaluator](keys, params, active & is_own, eval_steps)
+        places, is_given = np.minimum(np.arange(capacity), n - 1), np.arange(capacity) < n
+        trainings = jax.tree.map(lambda x: x[places], share.trainings)
+        trainings = dataclasses.replace(trainings, active=trainings.active & is_given)
+        outcome = self._programs[share.agent](trainings)
         outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
         return outcome, time.process_time() - started
 
 
-def _compiled_share(
-    learner: "Bilevel", evaluator: "Evaluator", capacity: int, num_parallel: int | None
-) -> Any:
-    """The program that evaluates up to `capacity` candidates."""
+def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel: int | None) -> Any:
+    """The program that evaluates up to `capacity` trainings of an agent."""
     import jax
 
-    from sejax.evaluation import of_vectors
     from sejax.ops.parallel import compiler_options, spread_over_devices
 
-    spread = spread_over_devices(
-        of_vectors(evaluator, learner.params_of), 1, num_parallel, evaluator.cpu_num_parallel
-    )
+    run, cpu_width = learner.evaluate.runs[agent], learner.evaluate.widths[agent]
+    spread = spread_over_devices(run, 1, num_parallel, cpu_width)
 
-    def evaluate(key_data: "Array", *arguments: "Array | None") -> "Outcome":
-        return spread(jax.random.wrap_key_data(key_data), *arguments)
+    def evaluate(sent: "Trainings") -> "Outcome":
+        return spread(dataclasses.replace(sent, key=jax.random.wrap_key_data(sent.key)))
 
-    def arguments(key: "Array") -> tuple[Any, ...]:
-        asked = learner.ask(learner.init(key))
-        return _at(_arguments(asked), np.zeros(capacity, int))
+    def example(key: "Array") -> "Trainings":
+        sent = _sent(learner, learner.ask(learner.init(key)))[agent]
+        return jax.tree.map(lambda x: x[np.zeros(capacity, int)], sent)
 
-    shapes = jax.eval_shape(arguments, jax.random.key(0))
-    return jax.jit(evaluate, compiler_options=compiler_options()).lower(*shapes).compile()
+    shapes = jax.eval_shape(example, jax.random.key(0))
+    return jax.jit(evaluate, compiler_options=compiler_options()).lower(shapes).compile()

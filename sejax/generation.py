@@ -1,0 +1,141 @@
+"""The trainings of a generation: fresh agents on the population and on the incumbent.
+
+Source: paper, Algorithm 1 (TrainAgent and EvaluateAgent, for all candidates).
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PyTree
+
+from sejax.es.base import Groups, StrategyState
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
+from sejax.objectives import Outcome
+from sejax.ops.parallel import spread_groups_over_devices
+from sejax.proxies.base import ProxyEnv
+from sejax.scoring import Scoring
+from sejax.training import TrainingConfig
+
+
+@struct.dataclass
+class Candidates:
+    """What a generation evaluates, and what `Strategy.tell` needs beside the scores."""
+
+    population: Float[Array, "pop dims"]
+    incumbent: Float[Array, " dims"]
+    keys: Groups[Array]  # of the trainings
+    active: Array  # whether anything is to be computed
+    test_params: PyTree  # of `Objective.test_env`; None for the task's
+    key_tell: Array
+    es_state: StrategyState  # after `Strategy.ask`
+
+
+@struct.dataclass
+class Trainings:
+    """The trainings of one agent in a generation, leaves `[training, ...]`."""
+
+    key: Array
+    candidate: Float[Array, "training dims"]
+    active: Array
+    test_params: PyTree
+
+
+class GenerationEvaluator:
+    """`evaluate(candidates) -> Groups[Outcome]`: all trainings of a generation, and their tests.
+
+    One program holds both groups: each agent's trainings, on candidates and on the incumbent, are
+    spread over the devices, and on each of them batches of `num_parallel` follow one another. No
+    training executes another agent's branch.
+
+    Args:
+      proxy: whose weights a candidate is.
+      unravel: a candidate to the weights.
+      training: how long each agent trains, and how it is tested.
+      scoring: who trains on which candidate, how often, and what test episodes are played in.
+      devices: None for all.
+      num_parallel: None for what suits each agent.
+
+    Attributes:
+      devices: as given.
+      runs: of each agent, `(training) -> Outcome` for one of its `Trainings`.
+      widths: of each agent, trainings in a vmapped batch on a CPU core; None for all.
+      sizes: of each agent, trainings in a generation.
+
+    Raises:
+      ConfigError: if there are fewer than `devices` devices.
+    """
+
+    def __init__(
+        self,
+        proxy: ProxyEnv,
+        unravel: Callable[[Float[Array, " dims"]], PyTree],
+        training: TrainingConfig,
+        scoring: Scoring,
+        devices: int | None = None,
+        num_parallel: int | None = None,
+    ):
+        self.devices = devices
+        agents, objective = scoring.mixture.agents, scoring.objective
+        training = tested_throughout(training) if objective.needs_tests else training
+        evaluators = [
+            make_evaluator(agent, proxy, proxy.task, training, objective.test_env)
+            for agent in agents
+        ]
+
+        def run_with(evaluate: Callable[..., Outcome]) -> Callable[[Trainings], Outcome]:
+            return lambda training: evaluate(
+                training.key,
+                proxy.params(unravel(training.candidate)),
+                training.active,
+                training.test_params,
+            )
+
+        self.runs = [run_with(evaluate) for evaluate in evaluators]
+        self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
+        self._candidates = scoring.candidates
+        self._num_evals = scoring.evaluations.num_evals
+        num_turns = scoring.evaluations.num_incumbent_evals // len(agents)
+        self.sizes = [numbers.size * self._num_evals + num_turns for numbers in self._candidates]
+        self._spread = spread_groups_over_devices(self.runs, devices, num_parallel, self.widths)
+
+    def __call__(self, candidates: Candidates) -> Groups[Outcome]:
+        by_agent = self._spread([(trainings,) for trainings in self.trainings(candidates)])
+        return self.outcomes(by_agent)
+
+    def trainings(self, candidates: Candidates) -> list[Trainings]:
+        """The trainings of each agent: on its candidates, and then on the incumbent."""
+        keys, shared = candidates.keys, (candidates.active, candidates.test_params)
+        by_agent = []
+        for agent, (numbers, size) in enumerate(zip(self._candidates, self.sizes, strict=True)):
+            population = jnp.repeat(candidates.population[numbers], self._num_evals, axis=0)
+            incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
+            active, test_params = jax.tree.map(lambda x, size=size: jnp.repeat(x, size), shared)
+            trainings = Trainings(
+                key=jnp.concatenate([keys.population[numbers].ravel(), keys.incumbent[:, agent]]),
+                candidate=jnp.concatenate([population, incumbent]),
+                active=active,
+                test_params=test_params,
+            )
+            by_agent.append(trainings)
+        return by_agent
+
+    def outcomes(self, by_agent: Sequence[Outcome]) -> Groups[Outcome]:
+        """The outcomes of `trainings`, by candidate and by turn of the incumbent."""
+        order = np.argsort(np.concatenate(self._candidates))
+        num_candidates = [numbers.size for numbers in self._candidates]
+
+        def population(*leaves: Array) -> Array:
+            by_candidate = [
+                leaf[: num * self._num_evals].reshape(num, self._num_evals, *leaf.shape[1:])
+                for leaf, num in zip(leaves, num_candidates, strict=True)
+            ]
+            return jnp.concatenate(by_candidate)[order]
+
+        def incumbent(*leaves: Array) -> Array:
+            pairs = zip(leaves, num_candidates, strict=True)
+            return jnp.stack([leaf[num * self._num_evals :] for leaf, num in pairs], axis=1)
+
+        return Groups(jax.tree.map(population, *by_agent), jax.tree.map(incumbent, *by_agent))

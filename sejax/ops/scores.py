@@ -1,0 +1,26 @@
+"""Statistics of scores that may not be finite, or equal but for rounding."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+_TIE = 1e-6  # of the score that others are compared with, or of 1 where that is smaller
+
+
+def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "*n"]:
+    """Whether scores are equal to another one but for rounding.
+
+    In single precision the mean of equal scores may be a few last digits off, whose share of each
+    other would be weights as large as any. The authors' code asks for a difference of 1e-6.
+    """
+    return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
+
+
+def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
+    """Mean of the finite scores; nan if there is none."""
+    finite = jnp.isfinite(scores)
+    return jnp.where(finite, scores, 0.0).sum() / finite.sum()
+
+
+def or_lowest(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Scores in which what is not finite is minus infinity."""
+    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)

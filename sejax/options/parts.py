@@ -1,0 +1,54 @@
+"""Parts of a program, each given as it is or as a configuration that makes it."""
+
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+
+from sejax.options import registry, require, shortened
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+@runtime_checkable
+class Makes(Protocol[T_co]):
+    """A configuration that makes a part, of a task or of whatever such a part is for."""
+
+    def make(self, argument: Any, /) -> T_co: ...
+
+
+@runtime_checkable
+class RunConfig(Protocol):
+    """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
+
+    @property
+    def generations(self) -> int: ...
+
+    def parts(self) -> dict[str, Any]: ...
+
+
+def made(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
+    """The part itself.
+
+    Args:
+      group: the field that it is given as.
+      cls: its class.
+      part: the part, or its configuration.
+      argument: of `Makes.make`.
+
+    Raises:
+      ConfigError: for anything else.
+    """
+    if not isinstance(part, cls) and isinstance(part, Makes):
+        part = registry.make(group, part, argument)
+    return require_part(group, cls, part)
+
+
+def require_part(group: str, cls: type[T], part: object) -> T:
+    """The part, if it is one of this class.
+
+    Raises:
+      ConfigError: for anything else.
+    """
+    fix = "Pass an object; sejax.config([...]) takes names."
+    must = f"must be a sejax.{cls.__name__}; got {shortened(repr(part))}. {fix}"
+    require(isinstance(part, cls), group, must)
+    return cast(T, part)
