@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from support import bits, printed, refusal
+from support import bits, refusal
 
 import sejax
 from sejax.ops import checksummed
@@ -275,7 +275,7 @@ def test_a_checksummed_file_that_says_something_else_is_refused(run, change):
         else:
             manifest[name] = value
     (run / CHECKPOINT).write_bytes(checksummed.pack(tensors, "sejax_run", manifest))
-    assert "whole checkpoint" in refused(run)
+    assert "whole files" in refused(run)
 
 
 def test_a_folder_or_a_sparse_file_of_30_gb_is_refused_without_being_read(run):
@@ -315,16 +315,6 @@ def test_another_configuration_is_refused_with_what_differs(run):
 def test_fields_that_change_no_number_may_change(run):
     assert go(run, 7, run_dir="elsewhere", devices=3, tracker={"name": "wandb"}) == 5
     assert yaml.safe_load((run / "config.yaml").read_text())["devices"] == 3
-
-
-def test_a_refusal_does_not_import_jax(run):
-    code = (
-        "import sys; from sejax.runs.run_directory import RunDirectory\n"
-        f"try: RunDirectory({str(run)!r}, {{'seed': 3}})\n"
-        "except ValueError as error: print(error)\n"
-        "assert 'jax' not in sys.modules"
-    )
-    assert "seed (7 there, 3 here)" in printed(sys.executable, "-c", code, timeout=60)
 
 
 @pytest.mark.parametrize("name", ["file/run", "a\0b", "/proc/run"])
