@@ -69,7 +69,7 @@ _EXPORTS = {
     "save": "sejax.proxies.io",
     "save_set": "sejax.proxies.io",
     "spread_over_devices": "sejax.ops.parallel",
-    "training_of": "sejax.training",
+    "training_of": "sejax.proxies.io",
 }
 _MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
@@ -106,11 +106,12 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         register_gymnax,
         save,
         save_set,
+        training_of,
     )
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
     from sejax.runs.config import config
     from sejax.runs.runtime import configure_xla
-    from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
+    from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 __all__ = [
     "AUC",

@@ -5,7 +5,7 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -28,14 +28,10 @@ from sejax.options import (
     not_negative,
     one_of,
     option,
-    registry,
     require,
     shortened,
 )
-from sejax.options.plain import from_plain
-from sejax.proxies.base import ProxyEnv, episode_limit, is_real, prepare
-from sejax.proxies.header import agents_of, is_registered
-from sejax.proxies.io import Proxy, ProxySet, stored_env
+from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -129,43 +125,6 @@ def budget_for(
     return dataclasses.replace(
         training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
     )
-
-
-def training_of(
-    proxy: ProxyEnv | Proxy | ProxySet, agent: AgentConfig | None = None
-) -> TrainingConfig:
-    """How long agents trained on a stored proxy when it was learned.
-
-    Args:
-      proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
-      agent: configuration of another agent that is to train on it, whose budget is then that of
-        `budget_for`; None for the training as it was.
-
-    Raises:
-      ConfigError: for a proxy that is not stored, or if its file does not tell it.
-
-    Example:
-      >>> import sejax
-      >>> training_of(sejax.load_proxy("cartpole")).stop_rule
-      'never'
-    """
-    env, config = stored_env(proxy)
-    stored: Any = config.get("training")
-    require(
-        isinstance(stored, Mapping),
-        "training",
-        f"must be given for {shortened(env.name)}, which does not say how long its agents "
-        "trained; got none. Set training=sejax.TrainingConfig(...).",
-    )
-    training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
-    if agent is None:
-        return training
-    known = [
-        registry.configure("agent", values)
-        for values in agents_of(config).values()
-        if is_registered("agent", values)
-    ]
-    return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
 
 
 def require_modes() -> None:

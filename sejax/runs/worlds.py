@@ -11,11 +11,11 @@ from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
-from sejax.proxies.io import Proxy, ProxySet, load_proxy
+from sejax.proxies.io import Proxy, ProxySet, load_proxy, training_of
 from sejax.runs import config as configuration
 from sejax.runs.compose import named
 from sejax.runs.config import EvaluateConfig, MixtureMember, members_of
-from sejax.training import TrainingConfig, require_reachable, training_of
+from sejax.training import TrainingConfig, require_reachable
 
 Loaded = TypeVar("Loaded", Proxy, ProxySet)
 
