@@ -207,7 +207,9 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         message = f"{option} must be a path or a name; got {text} ({type(error).__name__})."
         raise ConfigError(message, option) from None
     written = "which the first generation of a run writes"
-    require(not path.is_dir(), option, f"must be a folder with a {hub.FILE}, {written}; got {text}.")
+    require(
+        not path.is_dir(), option, f"must be a folder with a {hub.FILE}, {written}; got {text}."
+    )
     is_path = path.suffix or len(path.parts) != 1
     must = "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO"
     require(not is_path, option, f"{must}; got {text}, which does not exist.")

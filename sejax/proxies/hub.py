@@ -43,7 +43,7 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
     found = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     if found is None:
         must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
-        raise ConfigError(f"{option} {must}; got {shortened(address)}.", option)
+        raise ConfigError(f"{option} {must}; got {shortened(repr(address))}.", option)
     repo, revision, file = found.groups()
     return repo, revision, file or FILE
 
@@ -109,9 +109,9 @@ def _explained(option: str, place: str) -> Iterator[None]:
     except ConfigError:
         raise
     except Exception as error:  # the HTTP library's too, which differs between its versions
-        fix = "Check its name and the network, or log in with hf auth login"
+        fix = "Check the name and the network, or log in: hf auth login"
         if isinstance(error, ImportError):
             fix = "Install it with pip install 'sejax[hub]'"
-        got = f"got {shortened(place, 60)}: {shortened(told(error), 100)}"
+        got = f"got {shortened(place, 60)}: {shortened(told(error), 90)}"
         message = f"{option} must be within reach on the Hub; {got}. {fix}."
         raise ConfigError(message, option) from error
