@@ -149,21 +149,6 @@ def test_every_stored_result_loads():
 # --- damage --------------------------------------------------------------------------------------
 
 
-def test_every_flipped_bit_is_noticed(path):
-    """Of the weights and of the version; of the rest one bit in each byte, to save time."""
-    whole = path.read_bytes()
-    weights = 8 + int.from_bytes(whole[:8], "little")
-    version = whole.index(b"format_version")
-    every = {*range(8), *range(version, version + 24), *range(weights, len(whole))}
-    for position in range(len(whole)):
-        for bit in range(8) if position in every else [position % 8]:
-            damaged = bytearray(whole)
-            damaged[position] ^= 1 << bit
-            path.write_bytes(damaged)
-            with pytest.raises(ConfigError, match=r"^source must be "):
-                header.read_config(path)
-
-
 def test_a_file_that_is_damaged_or_foreign_is_refused(path, tmp_path):
     whole = path.read_bytes()
     for damaged in (whole[:-20], whole[:40], b"", whole + b"x"):
@@ -297,23 +282,6 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
             sejax.save_set(path, env, weights, [{}] * 3, discount=0.7)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path], "temporary files are removed"
-
-
-# --- nothing in a file is resolved or imported ---------------------------------------------------
-
-
-def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights, monkeypatch):
-    monkeypatch.setenv("SECRET", "hush")
-    text = "${oc.env:SECRET}"
-    config = CONFIG | {"preset": text, "agent": {"name": "q_learning", "note": text}}
-    sejax.save(path, env, weights[0], config, 0.7, note=text)
-    proxy = sejax.load_proxy(path)
-    assert proxy.config["preset"] == proxy.record["note"] == text
-    again = tmp_path / "again.safetensors"
-    sejax.save(again, env, proxy.params.weights, proxy.config, proxy.discount, **proxy.record)
-    assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
-    rewrite(path, lambda tensors, values: (tensors, "sejax", values | {"task": text}))
-    assert text in str(refusal(sejax.load, path))
 
 
 def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):

@@ -1,9 +1,7 @@
 """A run directory: resume, damage, kills at every file operation, full disks, two processes."""
 
 import contextlib
-import json
 import os
-import random
 import re
 import shutil
 import signal
@@ -145,15 +143,6 @@ def test_a_state_comes_back_bit_for_bit(tmp_path):
     assert not restored["placed"].committed
 
 
-def test_a_checkpoint_can_be_read_without_sejax(whole):
-    from safetensors import safe_open
-
-    with safe_open(whole / CHECKPOINT, "np") as file:
-        assert json.loads(file.metadata()["sejax_run"])["config"]["seed"] == 7
-        assert file.get_tensor("state['x']").tolist() == [5, 36]
-        assert file.get_tensor("metrics").tobytes() == (whole / "metrics.csv").read_bytes()
-
-
 def test_numbers_read_back_as_the_same_float32_or_integer(tmp_path):
     values = np.array([0.1, np.nan, -np.inf, 1e-45], np.float32)
     counts = np.array([0, 1, 2**31 - 1, 5], np.int32)
@@ -176,22 +165,7 @@ def test_a_column_that_an_older_version_did_not_write_is_nan(run, monkeypatch):
     assert lines[5][-1] == "nan" and lines[6][-1] == "1.5"
 
 
-def test_odd_values_of_a_configuration_are_the_same_when_read_again(tmp_path):
-    odd = {"nan": float("nan"), "tuple": (1, 2), "small": 1e-05, "text": "ä\n: #", "none": None,
-           "inf": float("inf"), "word": "yes", "bytes": os.fsdecode(b"\xc3\x28")}  # fmt: skip
-    go(tmp_path, 1, odd=odd)
-    assert go(tmp_path, 2, odd=odd) == 1
-
-
 # --- files beside the checkpoint, and without it -------------------------------------------------
-
-
-def test_a_file_that_is_lost_or_changed_is_remade(run, whole):
-    for data in (b"", b"\xff\0"):
-        (run / "metrics.csv").unlink()
-        (run / "config.yaml").write_bytes(data)
-        assert go(run, 5) == 5
-        assert results(run) == results(whole)
 
 
 @pytest.mark.parametrize("kept", ["metrics.csv", "proxy.safetensors", "checkpoint"])
@@ -219,14 +193,10 @@ def test_other_files_stay_and_only_temporaries_of_killed_sessions_are_removed(tm
 
 
 def test_a_damaged_checkpoint_is_one_message_and_changes_nothing(run):
-    path, draw = run / CHECKPOINT, random.Random(0)
+    path = run / CHECKPOINT
     data = path.read_bytes()
-    for number in range(300):
-        place, length = draw.randrange(len(data)), draw.randrange(1, 20)
-        noise, rest = draw.randbytes(length), data[place + length :]
-        flipped = bytes([data[place] ^ 1 << draw.randrange(8)]) + data[place + 1 :]
-        ways = (b"", noise + rest, flipped, data[place:] + noise, rest)
-        path.write_bytes(noise + data if number % 6 == 5 else data[:place] + ways[number % 6])
+    for damaged in (b"", data[:100], data[:-1], data + b"x", data.replace(b"0.0124", b"0.0125")):
+        path.write_bytes(damaged)
         said = refused(run)
         assert "\n" not in said and len(said) < 300 + len(str(path))
 
@@ -244,14 +214,6 @@ def test_a_checksummed_file_that_says_something_else_is_refused(run, change):
         else:
             manifest[name] = value
     (run / CHECKPOINT).write_bytes(checksummed.pack(tensors, "sejax_run", manifest))
-    refused(run)
-
-
-def test_a_folder_or_a_sparse_file_of_30_gb_is_refused_without_being_read(run):
-    os.truncate(run / CHECKPOINT, 30 << 30)
-    refusal(open_run, run)
-    (run / CHECKPOINT).unlink()
-    (run / CHECKPOINT).mkdir()
     refused(run)
 
 
