@@ -126,7 +126,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                 if ended == "diverged":
                     diverged.append(directory.path)
                 elif len(configs) == 1:
-                    progress.finish(directory, chunks.learner, scores[-1], ended)
+                    progress.finish(directory, chunks.learner, scores[-1])
     if len(configs) > 1:
         print("Best incumbent scores:")
         for config, score in zip(configs, scores, strict=True):

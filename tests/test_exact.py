@@ -11,8 +11,8 @@ import sejax
 from sejax.envs.base import Task
 from sejax.envs.spec import Box, Discrete, TaskSpec
 from sejax.options import ConfigError
-from sejax.proxies.absent import AbsentEnv
 from sejax.proxies.exact import gaussian, make_exact
+from sejax.proxies.io import AbsentEnv
 
 RNG = np.random.default_rng(0)
 OBS_DIM = 3

@@ -7,8 +7,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "sejax"
 # Modules and folders of sejax, the highest first. Each may import those below it, and its own
-# folder; not its neighbours. Names in strings (`sejax.options.registry`, `sejax.__getattr__`) are
-# looked up when somebody asks for what they stand for: they do not count.
+# folder; not its neighbours. A module may lie higher than its folder. Names in strings
+# (`sejax.options.registry`, `sejax.__getattr__`) are looked up when somebody asks for what they
+# stand for: they do not count.
 LAYERS = [
     {"__main__"},
     {"search"},
@@ -19,7 +20,8 @@ LAYERS = [
     {"generation"},
     {"evaluation", "scoring"},
     {"gym"},
-    {"stored proxies"},
+    {"proxies.io", "proxies.zoo", "proxies.exact"},
+    {"proxies.header"},
     {"training", "objectives"},
     {"proxies"},
     {"agents"},
@@ -28,9 +30,6 @@ LAYERS = [
     {"options"},
     {""},
 ]
-
-
-STORE = {f"sejax.proxies.{name}" for name in ("absent", "exact", "header", "hub", "io", "zoo")}
 
 
 def name_of(path):
@@ -43,10 +42,9 @@ TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
 
 
 def part_of(module):
-    """The module of the package's top, or the folder, that a module is or lies in."""
-    if module in STORE:
-        return "stored proxies"
-    return module.split(".")[1] if "." in module else ""
+    """The module, or the folder, of `LAYERS` that a module is or lies in."""
+    name = module.partition(".")[2]
+    return name if any(name in layer for layer in LAYERS) else name.partition(".")[0]
 
 
 def is_type_checking(node):

@@ -19,7 +19,6 @@ from sejax import envs
 from sejax.distillation.config import read
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
-from sejax.proxies.header import PRETRAINED_DIR
 from sejax.runs.config import evaluate_config
 from sejax.runs.worlds import proxy_setup
 from tools import make_zoo, ship_proxy
@@ -46,8 +45,6 @@ def test_each_has_a_card_that_says_what_it_teaches(name):
     assert proxy.is_distilled or proxy.agents
     assert all(map(math.isfinite, proxy.scores.values()))
     assert proxy.on_proxy and all(each.num_agents >= 10 for each in proxy.on_proxy)
-    assert proxy.size_kb == pytest.approx((PRETRAINED_DIR / f"{name}.safetensors").stat().st_size
-                                          / 1000)  # fmt: skip
     assert proxy.card.startswith(f"# {name}\n")
     for said in (f"`{proxy.task}`", f'sejax.load("{name}")', "Apache-2.0"):
         assert said in proxy.card
@@ -59,14 +56,16 @@ def test_each_has_a_card_that_says_what_it_teaches(name):
     assert best.agent in study.worlds["the proxy"][2], "the command trains what did best"
 
 
-@pytest.mark.parametrize("name", SES)
-def test_each_se_says_what_it_cost(name):
+@pytest.mark.parametrize("name", PROXIES)
+def test_each_says_what_it_cost(name):
     proxy = PROXIES[name]
     learning = proxy.learning
-    assert learning.cpu_s > 0 and learning.real_steps > 0
-    assert learning.train_steps > learning.agents and learning.generations >= proxy.generation
-    for said in (learning.command, f"{learning.cpu_s:,.0f} CPU seconds"):
-        assert said in proxy.card
+    for number in (learning.generations, learning.real_steps):
+        assert number > 0 and f"{number:,}" in proxy.card
+    assert learning.command in proxy.card
+    if proxy.kind == "se":
+        assert learning.cpu_s > 0 and learning.train_steps > learning.agents
+        assert learning.generations >= proxy.generation
 
 
 @pytest.mark.parametrize("name", sorted(set(SES) - set(DISTILLED)))
@@ -90,9 +89,8 @@ def test_the_command_of_each_distilled_se_is_one_of_its_task_and_students(name):
 
 
 @pytest.mark.parametrize("name", sorted(set(PROXIES) - set(SES)))
-def test_each_rn_says_what_it_cost(name):
+def test_the_command_of_each_rn_learns_as_long(name):
     learning = PROXIES[name].learning
-    assert learning.real_steps > 1e6 and f"| {learning.real_steps:,} |" in PROXIES[name].card
     assert sejax.config(shlex.split(learning.command)[3:]).generations == learning.generations
 
 
@@ -141,15 +139,13 @@ def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):
     assert shipped.evaluations == (each,) and shipped.scores == PROXIES["cartpole"].scores
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("hparams", "other"), ("world", "moon"), ("return_mean", []), ("agent", {})]
-)
+@pytest.mark.parametrize(("name", "value"), [("hparams", "other"), ("return_mean", [])])
 def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
     proxy = sejax.load_proxy("cartpole")
     evaluation = dataclasses.asdict(PROXIES["cartpole"].evaluations[0])
-    record = {"evaluations": [evaluation | {name: value}]}
     path = tmp_path / "odd.safetensors"
-    sejax.save(path, proxy.env, proxy.params.weights, **record)
+    evaluations = [evaluation | {name: value}]
+    sejax.save(path, proxy.env, proxy.params.weights, evaluations=evaluations)
     assert refused(zoo.describe, header.read(path)) == f"record.evaluations.{name}"
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from support import paper_se, refusal
+from support import paper_se, refusal, refused
 
 import sejax
 from sejax import envs
@@ -75,9 +75,9 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     proxy, proxies = sejax.load_proxy(path), sejax.load_set(path)
     assert proxy.record == {} and proxy.params.discount == 0.7
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
-    assert refusal(proxy.learned_with, "agent").field == "agent"
-    assert refusal(sejax.training_of, proxy).field == "training"
-    assert refusal(proxy.learned_with, "training").field == "group"
+    assert refused(proxy.learned_with, "agent") == "agent"
+    assert refused(sejax.training_of, proxy) == "training"
+    assert refused(proxy.learned_with, "training") == "group"
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,8 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(a_set, env, weights):
     for proxy, expected, record in zip(proxies, weights, proxies.records, strict=True):
         chex.assert_trees_all_equal(proxy.params.weights, expected)
         assert proxy.record == record and proxy.params.discount == 0.7
-    assert refusal(sejax.load, a_set).field == "source"
-    assert refusal(sejax.load_set, a_set, option="--ses", kind="se").field == "--ses"
+    assert refused(sejax.load, a_set) == "source"
+    assert refused(sejax.load_set, a_set, option="--ses", kind="se") == "--ses"
 
 
 def test_parts_of_a_set_are_chosen_by_score_and_place(a_set, weights):
@@ -149,33 +149,17 @@ def test_every_stored_result_loads():
 # --- damage --------------------------------------------------------------------------------------
 
 
-def test_every_flipped_bit_is_noticed(path):
-    """Of the weights and of the version; of the rest one bit in each byte, to save time."""
-    whole = path.read_bytes()
-    header.read_config(path)
-    weights = 8 + int.from_bytes(whole[:8], "little")
-    version = whole.index(b"format_version")
-    every = {*range(8), *range(version, version + 24), *range(weights, len(whole))}
-    for position in range(len(whole)):
-        for bit in range(8) if position in every else [position % 8]:
-            damaged = bytearray(whole)
-            damaged[position] ^= 1 << bit
-            path.write_bytes(damaged)
-            with pytest.raises(ConfigError, match=r"^source must be "):
-                header.read_config(path)
-
-
 def test_a_file_that_is_damaged_or_foreign_is_refused(path, tmp_path):
     whole = path.read_bytes()
     for damaged in (whole[:-20], whole[:40], b"", whole + b"x"):
         path.write_bytes(damaged)
-        assert refusal(sejax.load, path).field == "source"
+        assert refused(sejax.load, path) == "source"
     foreign = tmp_path / "x.safetensors"
     save_file({"x": np.zeros(3)}, foreign)
-    assert "damaged or of another format" in str(refusal(sejax.load, foreign))
+    assert refused(sejax.load, foreign) == "source"
     with path.open("wb") as sparse:  # which would not fit into memory
         sparse.truncate(10**12)
-    assert "1,000,000,000,000 bytes" in str(refusal(sejax.load, path))
+    assert refused(sejax.load, path) == "source"
 
 
 MISSING = object()
@@ -226,7 +210,7 @@ def test_metadata_of_another_shape_is_one_message(path):
 def test_metadata_that_is_something_else_is_one_message(tmp_path, text):
     path = tmp_path / "proxy.safetensors"
     save_file({"x": np.zeros(3)}, path, metadata={"sejax": text})
-    assert refusal(sejax.load, path).field == "source"
+    assert refused(sejax.load, path) == "source"
 
 
 @pytest.mark.parametrize(
@@ -249,7 +233,6 @@ def test_tensors_that_are_not_the_networks_are_one_message(path, change):
 
 
 @pytest.mark.parametrize("given, field", [
-    ({"env": "cartpole"}, "env"),
     ({"weights": {"potential": {}}}, "weights"),
     ({"weights": RewardConfig}, "weights"),
     ({"discount": None}, "discount"),
@@ -261,10 +244,10 @@ def test_tensors_that_are_not_the_networks_are_one_message(path, change):
 def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, field):
     before = path.read_bytes()
     given = {"env": env, "weights": weights[1], "discount": 0.7} | given
-    assert refusal(sejax.save, path, **given).field == field
-    assert refusal(sejax.save_set, path, env, weights[:2], [{}], discount=0.7).field == "records"
+    assert refused(sejax.save, path, **given) == field
+    assert refused(sejax.save_set, path, env, weights[:2], [{}], discount=0.7) == "records"
     odd = jax.tree.map(lambda x: x.at[..., 0].set(jnp.nan), weights[1])
-    assert refusal(sejax.save, path, env, odd, discount=0.7).field == "weights"
+    assert refused(sejax.save, path, env, odd, discount=0.7) == "weights"
     assert path.read_bytes() == before
 
 
@@ -282,7 +265,7 @@ def test_tensors_of_types_that_numpy_lacks_are_refused(path):
     data = data.replace(b'"U8"', b'"F8_E5M2"', 1)  # longer by 5: taken from the padding's count
     size = int.from_bytes(data[:8], "little") + 5
     path.write_bytes(size.to_bytes(8, "little") + data[8:])
-    assert "damaged" in str(refusal(sejax.load, path))
+    assert refused(sejax.load, path) == "source"
 
 
 def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, monkeypatch):
@@ -301,25 +284,8 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
     assert list(path.parent.iterdir()) == [path], "temporary files are removed"
 
 
-# --- nothing in a file is resolved or imported ---------------------------------------------------
-
-
-def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights, monkeypatch):
-    monkeypatch.setenv("SECRET", "hush")
-    text = "${oc.env:SECRET}"
-    config = CONFIG | {"preset": text, "agent": {"name": "q_learning", "note": text}}
-    sejax.save(path, env, weights[0], config, 0.7, note=text)
-    proxy = sejax.load_proxy(path)
-    assert proxy.config["preset"] == proxy.record["note"] == text
-    again = tmp_path / "again.safetensors"
-    sejax.save(again, env, proxy.params.weights, proxy.config, proxy.discount, **proxy.record)
-    assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
-    rewrite(path, lambda tensors, values: (tensors, "sejax", values | {"task": text}))
-    assert text in str(refusal(sejax.load, path))
-
-
 def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
-    assert refusal(sejax.load, path, task=envs.make("cliff_walking")).field == "source"
+    assert refused(sejax.load, path, task=envs.make("cliff_walking")) == "source"
     task = dataclasses.replace(envs.make("gridworld_2x2"), solved_reward=0.5)
     assert sejax.load_proxy(path, task=task).task is task
     longer = dataclasses.replace(task, max_steps=task.max_steps + 1)
@@ -329,7 +295,7 @@ def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
     sejax.save(se, env, weights)
     for change in ({"max_steps": 7}, {"env": envs.make("acrobot").env}):
         other = dataclasses.replace(env.task, **{"params": None, "max_steps": 200} | change)
-        assert refusal(sejax.load, se, task=other).field == "task"
+        assert refused(sejax.load, se, task=other) == "task"
 
 
 # --- without the task ----------------------------------------------------------------------------
@@ -357,7 +323,7 @@ def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
     assert header.read_config(again)["env"] == header.read_config(path)["env"]
     for use in (lambda: sejax.load_proxy(path).task, lambda: sejax.load_set(path).task,
                 lambda: rollout(there.task.env, there.task.params, jax.random.key(0))):  # fmt: skip
-        assert refusal(use).field == "task"
+        assert refused(use) == "task"
     assert sejax.load_proxy(path, task=task).task is task
 
 
@@ -379,7 +345,7 @@ def rollout(env, params, key, num_steps=4):
 def test_what_runs_its_task_needs_it(tmp_path, made):
     env, weights = made(dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None))
     sejax.save(tmp_path / "p.safetensors", env, weights, discount=0.7)
-    assert refusal(sejax.load, tmp_path / "p.safetensors").field == "task"
+    assert refused(sejax.load, tmp_path / "p.safetensors") == "task"
 
 
 def an_rn_of(task):
@@ -409,18 +375,12 @@ def test_an_unknown_name_lists_the_shipped_ones():
     assert "=real?" not in str(refusal(sejax.load, "real"))  # a word of a command's
 
 
-def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
-    for load in (sejax.load, sejax.load_set):
-        assert "it is no run" in str(refusal(load, tmp_path))
-    (tmp_path / "config.yaml").write_text("{}")
-    assert "no generation" in str(refusal(sejax.load, tmp_path))
-
-
 @pytest.mark.parametrize("name, given", [
     ("task", "cartpole"), ("proxy", "se"), ("source", None), ("source", 3),
-    ("source", "hf://" + "/" * 100), ("source", "n" * 10_000),
+    ("source", "hf://" + "/" * 100), ("source", "n" * 10_000), ("source", "."),
     ("source", "n" * 10_000 + ".safetensors"), ("source", "/".join(["n"] * 5000)),
     ("source", "a\0b"), ("source", "x/../y"), ("source", "nope.safetensors"),
 ], ids=lambda value: repr(value)[:20])  # fmt: skip
-def test_an_argument_that_cannot_be_is_one_short_message(name, given):
-    assert refusal(sejax.load, **{"source": "cartpole", name: given}).field == name
+def test_an_argument_that_cannot_be_is_one_short_message(tmp_path, monkeypatch, name, given):
+    monkeypatch.chdir(tmp_path)
+    assert refused(sejax.load, **{"source": "cartpole", name: given}) == name

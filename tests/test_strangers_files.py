@@ -102,7 +102,7 @@ def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreig
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
     data = checksummed.pack(rows, "sejax_run", manifest)
     (path / "checkpoint.safetensors").write_bytes(data)
-    assert "of the same configuration" in refused(run_command, *TASK, f"run_dir={path}")
+    assert "the same settings" in refused(run_command, *TASK, f"run_dir={path}")
 
 
 PRESETS = [

@@ -53,12 +53,13 @@ class FolderLock:
 
     NAME = "sejax.lock"
 
-    def __init__(self, folder: Path, hint: str):
+    def __init__(self, folder: Path, hint: str, field: str = "run_dir"):
         """Makes the folder and locks it; the lock ends with the process, however that ends.
 
         Args:
-          folder: the `run_dir` of a command.
+          folder: the folder.
           hint: last sentence of messages: how to choose another folder.
+          field: the field that names the folder.
 
         Raises:
           ConfigError: if another process uses it, or it cannot be written.
@@ -70,11 +71,11 @@ class FolderLock:
             self._lock.acquire()
         except filelock.Timeout as error:
             must = f"must be used by one at a time; got {folder}, which another process uses"
-            raise ConfigError(f"run_dir {must}. {hint}", "run_dir") from error
+            raise ConfigError(f"{field} {must}. {hint}", field) from error
         except (OSError, ValueError, NotImplementedError) as error:
             got = f"{shortened(folder)} ({shortened(error)})"
             must = f"must be a folder that can be written; got {got}"
-            raise ConfigError(f"run_dir {must}. {hint}", "run_dir") from error
+            raise ConfigError(f"{field} {must}. {hint}", field) from error
 
     def release(self, is_used: bool) -> None:
         """Lets other processes use the folder; leaves nothing behind unless `is_used`."""

@@ -140,7 +140,10 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
         try:
             read = _adapter(hint).validate_python(candidate)
         except ValidationError as error:
-            must = error.errors()[0]["msg"].removeprefix("Input should ")
+            first = error.errors()[0]
+            must, steps = first["msg"].removeprefix("Input should "), first["loc"]
+            if steps and isinstance(steps[0], int):  # of a list of dataclasses
+                name = ".".join([name, *(step for step in steps if isinstance(step, str))])
         else:
             if isinstance(candidate, bool) == isinstance(read, bool):  # which are numbers in Python
                 return read

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
-from sejax.ops.checksummed import DamagedError, pack, unpack
+from sejax.ops import checksummed
 from sejax.options import (
     LARGEST,
     ConfigError,
@@ -30,7 +30,11 @@ from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
-_KEY = "sejax"  # of the metadata's entry
+# What a caller gives for parts that no file can name: arguments of `sejax.load` by their groups,
+# and the words of a command.
+PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
+PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
+_KIND = "sejax"  # of the metadata's entry
 _LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
@@ -66,14 +70,10 @@ class Header:
             raise ValueError("no task or proxy")
         if not self.proxies or not all(isinstance(record, Mapping) for record in self.proxies):
             raise ValueError("no records")
-        for record in self.proxies:
-            numbers = [record[name] for name in ("score", "generation", "seed") if name in record]
-            numbers += dict(record.get("scores", {})).values()
-            if not all(map(is_number, numbers)):
-                raise ValueError("a record without numbers")
-            np.array(numbers, float)  # OverflowError for one that is too large
-        if not 0 <= self.discount <= 1:
-            raise ValueError("a discount outside of [0, 1]")
+        numbers = [self.discount, *(x for record in self.proxies for x in _numbers_of(record))]
+        if not (all(map(is_number, numbers)) and 0 <= self.discount <= 1):
+            raise ValueError("a record without numbers, or a discount outside of [0, 1]")
+        np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
         if not (
             _is_count(spec.max_steps) and _is_space(spec.observation) and _is_space(spec.action)
@@ -105,6 +105,12 @@ class Stored(NamedTuple):
     header: Header
 
 
+def _numbers_of(record: Mapping[str, Any]) -> list[Any]:
+    """What must be numbers in a record, if it is there."""
+    known = [record[name] for name in ("score", "generation", "seed") if name in record]
+    return [*known, *dict(record.get("scores", {})).values()]
+
+
 def _is_count(number: object) -> bool:
     return type(number) is int and 0 < number <= LARGEST
 
@@ -113,16 +119,12 @@ def _is_space(space: Space) -> bool:
     """Whether a space has entries, bounds of single precision in their order, and a fit shape."""
     if not isinstance(space, Box):
         return _is_count(space.n)
-    if space.image and not (
-        len(space.image) == 3
-        and all(map(_is_count, space.image))
-        and math.prod(space.image) == space.size
-    ):
-        return False
-    pairs = list(zip(space.low, space.high, strict=True))
-    are_floats = all(math.isinf(x) or abs(x) <= _LARGEST_FLOAT for pair in pairs for x in pair)
-    are_ordered = all(low <= high and low < math.inf and high > -math.inf for low, high in pairs)
-    return bool(pairs) and are_floats and are_ordered
+    image = space.image
+    is_image = len(image) == 3 and all(map(_is_count, image)) and math.prod(image) == space.size
+    low, high = bounds = np.array([space.low, space.high], float)
+    is_float = np.isinf(bounds) | (np.abs(bounds) <= _LARGEST_FLOAT)
+    is_ordered = (low <= high) & (low < np.inf) & (high > -np.inf)
+    return bool((not image or is_image) and low.size and is_float.all() and is_ordered.all())
 
 
 def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
@@ -150,20 +152,28 @@ def is_registered(group: str, stored: object) -> bool:
     return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
 
 
-def configured(group: str, values: object, where: str) -> Any:
+def configured(group: str, values: object, where: str, option: str = "") -> Any:
     """The configuration of a group that a file holds as plain values.
+
+    Args:
+      group: such as `agent`.
+      values: of the file.
+      where: the file, for messages.
+      option: name of the argument that named the file, for messages; none if it is empty.
 
     Raises:
       ConfigError: if they are none, or of a name that is not registered.
     """
+    if is_registered(group, values):
+        return registry.configure(group, values)  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
-    require(
-        is_registered(group, values),
-        group,
-        f"must be a registered one in {shortened(where, 60)}, because what a file names is "
-        f"never imported; got {shortened(name, 60)}. Set {group} to one of your own.",
+    field = PLUGIN_ARGUMENTS.get(group, group)
+    words = f", or {PLUGIN_WORDS[group]}=MODULE:NAME in a command" if option else ""
+    raise ConfigError(
+        f"{option or field} must have a registered {group}, because what a file names is never "
+        f"imported; got {shortened(name, 40)} in {shortened(where, 40)}. Set {field}=...{words}.",
+        field,
     )
-    return registry.configure(group, values)  # type: ignore[arg-type]
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -187,29 +197,24 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     """
     if hub.is_address(source):
         return hub.fetch(str(source), option)
-    text = shortened(source)
+    name, text = str(source), shortened(source)
     try:
-        path = Path(expanded(source) if isinstance(source, str) else source)
-        is_run = path.is_dir()
-        file = path / hub.FILE if is_run else path
+        path = Path(expanded(name))
+        file = path / hub.FILE if path.is_dir() else path
         if file.is_file():
             return file
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError) as error:
         message = f"{option} must be a path or a name; got {text} ({type(error).__name__})."
         raise ConfigError(message, option) from None
-    reason = "no generation has ended yet" if (path / "config.yaml").exists() else "it is no run"
+    written = "which the first generation of a run writes"
     require(
-        not is_run, option, f"must be a run directory with a {hub.FILE}; got {text} ({reason})."
+        not path.is_dir(), option, f"must be a folder with a {hub.FILE}, {written}; got {text}."
     )
-    require(
-        not path.suffix and len(path.parts) == 1,
-        option,
-        "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO; got "
-        f"{text}, which does not exist.",
-    )
-    name, shipped = str(source), pretrained_names()
-    if name not in shipped:
-        raise unknown_name(option, text, [*shipped, *also])
+    is_path = path.suffix or len(path.parts) != 1
+    must = "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO"
+    require(not is_path, option, f"{must}; got {text}, which does not exist.")
+    if name not in pretrained_names():
+        raise unknown_name(option, text, [*pretrained_names(), *also])
     return PRETRAINED_DIR / f"{name}.safetensors"
 
 
@@ -234,10 +239,7 @@ def read(
     path = find(source, option)
     where = shortened(path, 60)
     try:
-        size = path.stat().st_size
-        if size > hub.MAX_BYTES:
-            raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
-        tensors, plain = unpack(path.read_bytes(), _KEY)
+        tensors, plain = checksummed.read(path, _KIND)
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
@@ -245,18 +247,12 @@ def read(
             f"of another format ({shortened(error, 60)}). The run writes it again.",
             option,
         ) from error
-    require(
-        not kinds or header.kind in kinds,
-        option,
-        f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}; got "
-        f"proxy={shortened(header.kind, 40)} in {where}.",
-    )
+    must = f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}"
+    got = f"got proxy={shortened(header.kind, 40)} in {where}"
+    require(not kinds or header.kind in kinds, option, f"{must}; {got}.")
     count = len(header.proxies)
-    require(
-        not single or count == 1,
-        option,
-        f"must be a single proxy; got a set of {count} in {where}. sejax.load_set reads sets.",
-    )
+    got = f"got a set of {count} in {where}. sejax.load_set reads sets"
+    require(not single or count == 1, option, f"must be a single proxy; {got}.")
     return Stored(path, tensors, header)
 
 
@@ -275,7 +271,7 @@ def packed(tensors: dict[str, np.ndarray], header: Header) -> bytes:
     Raises:
       TypeError or ValueError: if the header's values are not plain.
     """
-    return pack(tensors, _KEY, vars(header))
+    return checksummed.pack(tensors, _KIND, vars(header))
 
 
 def check_tensors(
@@ -295,12 +291,11 @@ def check_tensors(
     Raises:
       ConfigError: for other names, shapes or types, or numbers that are not finite.
     """
-    there = {name: x.shape for name, x in tensors.items()}
-    odd = [n for n, x in tensors.items() if x.dtype != np.float32 or not np.isfinite(x).all()]
-    got = f"others in {odd[0]}" if odd and there == shapes else f"the shapes {there}"
+    got = {name: x.shape for name, x in tensors.items()}
+    are_numbers = all(x.dtype == np.float32 and np.isfinite(x).all() for x in tensors.values())
     require(
-        there == shapes and not odd,
+        got == shapes and are_numbers,
         field,
         f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}; got "
-        f"{shortened(got, 60)}. Set {field} to {fix}.",
+        f"{shortened(got, 60) if got != shapes else 'others'}. Set {field} to {fix}.",
     )

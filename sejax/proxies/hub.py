@@ -10,7 +10,6 @@ import contextlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from sejax.options import ConfigError, require, shortened, told
 
@@ -20,24 +19,10 @@ MAX_BYTES = 100_000_000  # of a file: a hundred times the largest set of proxies
 
 _REPO = r"[\w-][\w.-]*/[\w-][\w.-]*"
 _ADDRESS = re.compile(
-    rf"{SCHEME}(?P<repo>{_REPO})(@(?P<revision>refs/pr/\d+|\w[\w.-]*))?"
-    r"(/(?P<file>(\w[\w.-]*/){0,8}\w[\w.-]*\.safetensors))?",
+    rf"{SCHEME}({_REPO})(?:@(refs/pr/\d+|\w[\w.-]*))?"
+    r"(?:/((?:\w[\w.-]*/){0,8}\w[\w.-]*\.safetensors))?",
     re.ASCII,
 )
-
-
-class Address(NamedTuple):
-    """A file on the Hub.
-
-    Attributes:
-      repo: `USER/REPO`, a repository of models.
-      revision: branch, tag or commit; None for the main branch.
-      file: path of the file there.
-    """
-
-    repo: str
-    revision: str | None
-    file: str
 
 
 def is_address(source: object) -> bool:
@@ -45,24 +30,22 @@ def is_address(source: object) -> bool:
     return str(source).startswith(SCHEME)
 
 
-def parse(address: str, option: str = "source") -> Address:
-    """The parts of an address.
+def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
+    """Repository, revision (None for the main branch) and file of an address.
 
     Raises:
       ConfigError: for text that is not an address.
 
     Example:
       >>> parse("hf://user/repo@v1")
-      Address(repo='user/repo', revision='v1', file='proxy.safetensors')
+      ('user/repo', 'v1', 'proxy.safetensors')
     """
     found = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     if found is None:
-        raise ConfigError(
-            f"{option} must be hf://USER/REPO[@REVISION][/FILE.safetensors]; got "
-            f"{shortened(address)}.",
-            option,
-        )
-    return Address(found["repo"], found["revision"], found["file"] or FILE)
+        must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
+        raise ConfigError(f"{option} {must}; got {shortened(repr(address))}.", option)
+    repo, revision, file = found.groups()
+    return repo, revision, file or FILE
 
 
 def fetch(address: str, option: str = "source") -> Path:
@@ -76,18 +59,14 @@ def fetch(address: str, option: str = "source") -> Path:
       ConfigError: for text that is not an address, or a file that is not there, is too large or
         cannot be reached; or if `huggingface_hub` is not installed.
     """
-    place = parse(address, option)
+    repo, revision, file = parse(address, option)
     with _explained(option, address):
         from huggingface_hub import hf_hub_download
 
-        repo, file, revision = place.repo, place.file, place.revision
-        found = hf_hub_download(repo, file, revision=revision, dry_run=True)
-        size: int | None = found.file_size
-        require(
-            size is not None and size <= MAX_BYTES,
-            option,
-            f"must have at most {MAX_BYTES:,} bytes; got {size} bytes at {address}.",
-        )
+        size = hf_hub_download(repo, file, revision=revision, dry_run=True).file_size
+        got = f"got {size} bytes at {address}"
+        is_small = size is not None and size <= MAX_BYTES
+        require(is_small, option, f"must have at most {MAX_BYTES:,} bytes; {got}.")
         return Path(hf_hub_download(repo, file, revision=revision))
 
 
@@ -122,42 +101,17 @@ def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -
         api.create_commit(repo, additions, commit_message=message)
 
 
-# What to say of an error of `huggingface_hub`, or of the nearest of its base classes.
-_REASONS = {
-    "GatedRepoError": "its owner gives access on request. Ask there, then hf auth login",
-    "RepositoryNotFoundError": "there is no such repository, or it is private. Check its name, or "
-    "log in with hf auth login",
-    "RevisionNotFoundError": "the repository has no such revision. Leave it out for the newest",
-    "RemoteEntryNotFoundError": "the repository has no such file. Name one: "
-    "hf://USER/REPO/FILE.safetensors",
-    "LocalEntryNotFoundError": "the Hub cannot be reached, and no copy is here. Connect to the "
-    "network, or load a file",
-}
-
-
 @contextlib.contextmanager
 def _explained(option: str, place: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
-    place = shortened(place, 60)
     try:
         yield
     except ConfigError:
         raise
     except Exception as error:  # the HTTP library's too, which differs between its versions
-        message = f"{option} must be within reach on the Hub; got {place}: {_reason(error)}."
+        fix = "Check the name and the network, or log in: hf auth login"
+        if isinstance(error, ImportError):
+            fix = "Install it with pip install 'sejax[hub]'"
+        got = f"got {shortened(place, 60)}: {shortened(told(error), 90)}"
+        message = f"{option} must be within reach on the Hub; {got}. {fix}."
         raise ConfigError(message, option) from error
-
-
-def _reason(error: Exception) -> str:
-    """What is wrong, and what to do about it."""
-    if isinstance(error, ImportError):
-        return f"{error}. Install it with pip install 'sejax[hub]'"
-    from huggingface_hub.errors import HfHubHTTPError
-
-    for kind in type(error).__mro__:
-        if kind.__name__ in _REASONS:
-            return _REASONS[kind.__name__]
-    status = error.response.status_code if isinstance(error, HfHubHTTPError) else None
-    if status in (401, 403):
-        return f"you may not do that (HTTP {status}). Log in with hf auth login and a write token"
-    return f"{shortened(told(error), 100)}. Try again, or work with a local file"

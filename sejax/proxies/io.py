@@ -1,21 +1,25 @@
 """Proxies from and to files: `save`, `load`, and what is known of a stored proxy."""
 
 import dataclasses
+import functools
 import hashlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, NoReturn, overload
 
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from sejax import envs
 from sejax.agents import Agent, make_agent
 from sejax.agents.base import AgentConfig
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment
+from sejax.envs.spec import TaskSpec
 from sejax.ops.files import write_bytes
 from sejax.options import (
     ConfigError,
@@ -29,7 +33,6 @@ from sejax.options import (
 )
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
-from sejax.proxies.absent import absent_task, require_present
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
 from sejax.training import TrainingConfig
@@ -60,7 +63,9 @@ class _Loaded:
         Raises:
           ConfigError: if it cannot be made here, and the file told what the proxy needs of it.
         """
-        return require_present(self.env.task)
+        if isinstance(self.env.task.env, AbsentEnv):
+            self.env.task.env.fail()
+        return self.env.task
 
     def learned_with(self, group: str) -> Any:
         """A part of the configuration that it was learned with, such as `agent` or `es`.
@@ -244,8 +249,7 @@ def training_of(
       ConfigError: for a proxy that is not stored, or if its file does not tell it.
 
     Example:
-      >>> import sejax
-      >>> training_of(sejax.load_proxy("cartpole")).stop_rule
+      >>> training_of(load_proxy("cartpole")).stop_rule
       'never'
     """
     env, config = stored_env(proxy)
@@ -355,14 +359,9 @@ def save_set(
       ConfigError: as `save`, or if there are not as many records as proxies.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    are_lists = isinstance(weights, Sequence) and isinstance(records, Sequence)
-    require(
-        are_lists and len(weights) == len(records) > 0,
-        "records",
-        "must be one for each proxy; got "
-        f"{f'{len(records)} for {len(weights)}' if are_lists else 'others than lists'}. "
-        "Set records=[{}] * len(weights).",
-    )
+    got = f"got {len(records)} for {len(weights)}. Set records=[{{}}] * len(weights)"
+    is_one_each = len(weights) == len(records) > 0
+    require(is_one_each, "records", f"must be one for each proxy; {got}.")
     _write(path, env, weights, records, config, discount, is_set=True)
 
 
@@ -376,18 +375,13 @@ def _write(
     is_set: bool,
 ) -> None:
     require(
-        isinstance(env, ProxyEnv),
-        "env",
-        f"must be a sejax.ProxyEnv; got {type(env).__name__}. Set env, _ = sejax.load(source).",
-    )
-    require(
         discount is not None or not env.config.needs_discount,
         "discount",
         "must be given for a potential-based reward network; got None. Set "
         "discount=params.discount, that of the agent.",
     )
-    each = [_tensors_of(env, one) for one in weights]
-    tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
+    of_proxies = [_tensors_of(env, of_one) for of_one in weights]
+    tensors = {name: np.stack([of_one[name] for of_one in of_proxies]) for name in of_proxies[0]}
     known = {
         "env": env.task.origin or {"name": env.task.name},
         "proxy": registry.describe("proxy", env.config),
@@ -403,7 +397,7 @@ def _write(
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
-        data = header.packed(tensors if is_set else each[0], stored)
+        data = header.packed(tensors if is_set else of_proxies[0], stored)
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(
             "config, discount and record must be plain values that sejax.load takes; got "
@@ -539,48 +533,31 @@ def _proxies_of(
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
     for name, given, kind in (("task", task, Task), ("proxy", proxy, ProxyConfig)):
-        require(
-            given is None or isinstance(given, kind),
-            name,
-            f"must be a sejax.{kind.__name__}; got {shortened(repr(given))}. Leave it out for a "
-            f"registered {name}.",
-        )
+        is_kind = given is None or isinstance(given, kind)
+        got = f"got {shortened(repr(given))}. Leave it out for a registered {name}"
+        require(is_kind, name, f"must be a sejax.{kind.__name__}; {got}.")
+    found, where = stored.header, stored.path.name
     if proxy is None:
-        proxy = _registered("proxy", "proxy", "proxy_kind", stored, option)
-    found, is_given = stored.header, task is not None
-    if task is None:
+        proxy = header.configured("proxy", found.config["proxy"], where, option)
+    real = task
+    if real is None:
         try:
-            task = envs.make_from(_registered("env", "task", "env", stored, option))
+            real = envs.make_from(header.configured("env", found.config["env"], where, option))
         except ConfigError as error:
             if proxy.needs_task:
                 raise
-            task = absent_task(found, str(error))
-    require(
-        found.task == task.name,
-        option,
-        f"must be a proxy of the task {task.name}; got one of {shortened(found.task, 40)} in "
-        f"{shortened(stored.path.name, 40)}. Set another task.",
-    )
-    if is_given:
-        _require_same(found, task, proxy, stored.path)
-    return registry.make("proxy", proxy, task)
+            known = json.dumps([found.interface, found.config["env"]], sort_keys=True)
+            real = _absent_task(found.task, known, str(error))
+    got = f"got one of {shortened(found.task, 40)} in {shortened(where, 40)}. Set another task"
+    is_its_task = found.task == real.name
+    require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
+    if task is not None:
+        _require_same(found, task, proxy, where)
+    env: ProxyEnv = registry.make("proxy", proxy, real)
+    return env
 
 
-def _registered(group: str, argument: str, word: str, stored: Stored, option: str) -> Any:
-    """The configuration of a group, if its name is one that sejax or a package has registered."""
-    values = stored.header.config[group]
-    if not header.is_registered(group, values):
-        raise ConfigError(
-            f"{option} must be a proxy of a registered {group}, because what a file names is never "
-            f"imported; got {shortened(values.get('name'), 40)} in "
-            f"{shortened(stored.path.name, 40)}. Set {argument}=... of sejax.load, or "
-            f"{word}=MODULE:NAME in a command.",
-            argument,
-        )
-    return registry.configure(group, values)
-
-
-def _require_same(learned: Header, task: Task, proxy: ProxyConfig, path: Path) -> None:
+def _require_same(learned: Header, task: Task, proxy: ProxyConfig, where: str) -> None:
     """Checks that a task given is that of the proxy, as far as the proxy depends on it.
 
     An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
@@ -593,12 +570,53 @@ def _require_same(learned: Header, task: Task, proxy: ProxyConfig, path: Path) -
         "max_steps": spec.max_steps == task.max_steps or proxy.has_real_dynamics,
     }
     for name, is_same in same.items():
-        require(
-            is_same,
-            "task",
-            f"must have the {name} {shortened(learned.interface[name], 60)} of "
-            f"{shortened(path.name, 40)}; got {shortened(task.interface[name], 60)}.",
-        )
+        must = f"must have the {name} {shortened(learned.interface[name], 60)}"
+        got = f"of {shortened(where, 40)}; got {shortened(task.interface[name], 60)}"
+        require(is_same, "task", f"{must} {got}.")
+
+
+# --- a task that cannot be made here --------------------------------------------------------------
+
+
+class AbsentEnv(Environment):
+    """The spaces of a task that cannot be made here, for an SE that needs no more of it.
+
+    Such an SE can be loaded without the package that its task needs, or on a device that the task
+    does not run on. `reset_env` and `step_env` raise the reason as a `ConfigError`.
+    """
+
+    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        super().__init__(spec)
+        self._task_name, self._reason = task_name, reason
+
+    def fail(self) -> NoReturn:
+        """Raises the reason as a `ConfigError`."""
+        raise ConfigError(self._reason, "task")
+
+    def reset_env(self, key: Array, params: PyTree) -> NoReturn:
+        self.fail()
+
+    def step_env(self, key: Array, state: PyTree, action: Array, params: PyTree) -> NoReturn:
+        self.fail()
+
+    @property
+    def name(self) -> str:
+        return self._task_name
+
+
+@functools.cache
+def _absent_task(name: str, known: str, reason: str) -> Task:
+    """A task of which no more is known than what a proxy's file says; built once.
+
+    Args:
+      name: of the task.
+      known: its interface and its configuration, as JSON.
+      reason: why the task itself cannot be made.
+    """
+    interface, origin = json.loads(known)
+    spec = TaskSpec.of_interface(interface)
+    env = AbsentEnv(name, spec, reason)
+    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
 
 
 # --- gymnax ---------------------------------------------------------------------------------------

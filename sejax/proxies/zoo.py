@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import yaml
 
-from sejax.options import registry
-from sejax.options.plain import from_plain
+from sejax.options import as_text, is_number
+from sejax.options.plain import from_plain, to_plain
 from sejax.proxies import header, hub
-from sejax.proxies.synthetic import SyntheticConfig
 
 CARD = Path(__file__).with_name("card.md")
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
@@ -111,12 +110,12 @@ class PretrainedProxy:
     @property
     def on_proxy(self) -> tuple[Evaluation, ...]:
         """The evaluations of agents that trained on it, and not on the real task."""
-        return tuple(each for each in self.evaluations if each.world == "proxy")
+        return tuple(x for x in self.evaluations if x.world == "proxy")
 
     @property
     def card(self) -> str:
         """The model card, in Markdown."""
-        return card_of(self, self.name, (), SHIPPED_LICENSE)
+        return card_of(self, self.name)
 
     @property
     def row(self) -> dict[str, str]:
@@ -170,26 +169,23 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     Raises:
       ConfigError: for an evaluation or a learning of another shape.
     """
-    path, _, told = stored
-    record, objective = told.proxies[0], told.config.get("objective")
+    path, _, of_file = stored
+    record, config = of_file.proxies[0], of_file.config
     names = ("scores", "generation", "seed", "evaluations", "learning", "policy_return")
     known = {name: record[name] for name in names if record.get(name) is not None}
     if "score" in record:
-        agents = header.agents_of(told.config)
+        agents = header.agents_of(config)
         known.setdefault("scores", dict.fromkeys(agents, float(record["score"])))
-    described: PretrainedProxy = from_plain(
-        PretrainedProxy,
-        {
-            "name": name or path.stem,
-            "kind": told.kind,
-            "task": told.task,
-            "settings": told.config["proxy"],
-            "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
-            "size_kb": path.stat().st_size / 1000,
-            **known,
-        },
-        "record",
-    )
+    if isinstance(config.get("objective"), Mapping):
+        known["objective"] = config["objective"].get("name", "")
+    values = {
+        "name": name or path.stem,
+        "kind": of_file.kind,
+        "task": of_file.task,
+        "settings": config["proxy"],
+        "size_kb": path.stat().st_size / 1000,
+    }
+    described: PretrainedProxy = from_plain(PretrainedProxy, values | known, "record")
     return described
 
 
@@ -215,53 +211,44 @@ _ABOUT = {
     "steps. It may not help other agents, or may harm them.",
 }
 _ABOUT_OTHER = "A proxy for the task `{task}`, of its author's own kind `{kind}`."
-_STARTS = {
-    "real": "the real task's",
-    "learned": "made by a network from noise",
-    "noise": "standard normal noise",
-}
-_ENDS = {
-    "threshold": "where the done output exceeds 1/2",
-    "bernoulli": "with the probability that the done output is",
-    "sigmoid": "with the probability that the done output's sigmoid is",
-    "soft": 'where the done output exceeds 1/2; agents must bootstrap with `info["discount"]`',
-}
-_COSTS = {"distance": "distance to", "quadratic": "squared distance to"}
-_SCORES = {"reward_threshold": "minus the training steps until solved, and a penalty if unsolved"}
-_HPARAMS = {"default": "default", "varied": "drawn for each", "as_learned": "as it was learned"}
-_WORLDS = {"proxy": "this proxy", "real": "the real task"}
 
 
-def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_text: str) -> str:
+def card_of(
+    proxy: PretrainedProxy,
+    source: str,
+    needs: Sequence[str] = (),
+    license_text: str = SHIPPED_LICENSE,
+) -> str:
     """A proxy's model card, `card.md` with its values; sections of what is not known are left out.
 
     Args:
       proxy: what its file tells.
       source: what `sejax.load` takes.
-      needs: the arguments that `sejax.load` needs beside it (`task`, `proxy`), because a file's
-        names are never imported.
+      needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
+        file's names are never imported.
       license_text: a sentence, or the license's name.
     """
-    options = {"task": "env", "proxy": "proxy_kind"}  # of commands, for arguments of `sejax.load`
-    call = f'("{source}"' + "".join(f", {name}=..." for name in needs) + ")"
+    arguments = "".join(f", {header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)
+    words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
+    call = f'("{source}"{arguments})'
     gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
     values = {
         "name": proxy.name,
         "about": _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind),
-        "facts": table([{"property": key, "value": x} for key, x in _facts(proxy).items()]),
-        "evaluations": table([*map(_cells, proxy.evaluations)]) or None,
-        "command": proxy.learning.command if proxy.learning else None,
+        "facts": table([{"field": key, "value": text} for key, text in _facts(proxy).items()]),
+        "evaluations": table([*map(_cells, proxy.evaluations)]),
+        "command": proxy.learning.command if proxy.learning else "",
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
         "gym": gym if proxy.kind == "se" else "",
         "call": call,
         "source": source,
-        "overrides": "".join(f" {options[name]}=..." for name in needs) + _words_of_best(proxy),
+        "overrides": words + _words_of_best(proxy),
         "license": license_text,
     }
-    unknown = [f"{{{name}}}" for name, value in values.items() if value is None]
+    unknown = [f"{{{name}}}" for name in ("evaluations", "command") if not values[name]]
     sections = CARD.read_text(encoding="utf-8").rstrip().split("\n\n## ")
-    told = [text for text in sections if not any(field in text for field in unknown)]
-    return "\n\n## ".join(told).format(**values)
+    kept = [text for text in sections if not any(field in text for field in unknown)]
+    return "\n\n## ".join(kept).format(**values)
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -272,62 +259,41 @@ def table(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _cells(each: Evaluation) -> dict[str, str]:
+def _facts(proxy: PretrainedProxy) -> dict[str, str]:
+    """What is known of a proxy, by field: its settings, its scores, and what it cost."""
+    elsewhere = ("name", "kind", "task", "size_kb", "evaluations")
+    plain = {name: x for name, x in to_plain(proxy).items() if name not in elsewhere}
+    if proxy.learning:
+        plain["learning"].pop("command")
+    texts = {name: _text(value) for name, value in plain.items()}
+    return {name: text for name, text in texts.items() if text}
+
+
+def _text(value: object) -> str:
+    """A plain value on one line; nothing for None."""
+    if isinstance(value, Mapping):
+        texts = {name: _text(inner) for name, inner in value.items()}
+        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
+    if is_number(value):
+        return f"{value:,.5g}" if isinstance(value, float) else f"{value:,}"
+    return "" if value is None else as_text(value)
+
+
+def _cells(evaluation: Evaluation) -> dict[str, str]:
     """An evaluation's row in a card."""
     return {
-        "agent": each.agent,
-        "hyperparameters": _HPARAMS[each.hparams],
-        "trained on": _WORLDS[each.world],
-        "return": f"{each.return_mean:.1f} ± {each.return_std:.1f}",
-        "training steps": f"{each.train_steps:,.0f}",
-        "agents": str(each.num_agents),
+        "agent": evaluation.agent,
+        "hyperparameters": evaluation.hparams,
+        "trained on": evaluation.world,
+        "return": f"{evaluation.return_mean:.1f} ± {evaluation.return_std:.1f}",
+        "training steps": f"{evaluation.train_steps:,.0f}",
+        "agents": str(evaluation.num_agents),
     }
-
-
-def _facts(proxy: PretrainedProxy) -> dict[str, str]:
-    """What is known of a proxy's episodes and of how it was learned, by property."""
-    facts = {}
-    if proxy.kind == "se":
-        config: SyntheticConfig = registry.configure("proxy", proxy.settings)
-        limit = f"at most {config.horizon} steps" if config.horizon else "the real task's limit"
-        facts["initial states"] = _STARTS[config.initial_state]
-        facts["episodes"] = "one step: a contextual bandit" if config.is_bandit else limit
-        if config.reward_form != "network":
-            cost = _COSTS[config.reward_form]
-            facts["reward"] = f"minus the {cost} an action that a network makes"
-        if not config.is_bandit:
-            later = f", from step {config.min_steps} on" if config.min_steps > 1 else ""
-            facts["an episode ends"] = _ENDS[config.done] + later
-    if proxy.policy_return is not None:
-        facts["distilled"] = (
-            f"from a policy that reaches {proxy.policy_return:.1f} itself: its reward is that "
-            "policy, and no agent was trained to learn it"
-        )
-    if proxy.scores:
-        meaning = _SCORES.get(proxy.objective)
-        facts["agents"] = ", ".join(proxy.agents)
-        facts["score"] = ", ".join(f"{agent} {x:.1f}" for agent, x in proxy.scores.items())
-        facts["score"] += f" ({meaning})" if meaning else ""
-    for name, number in (("generation", proxy.generation), ("seed", proxy.seed)):
-        facts |= {} if number is None else {name: str(number)}
-    if proxy.learning:
-        learning = proxy.learning
-        costs = {
-            "CPU seconds": learning.cpu_s,
-            "generations": learning.generations,
-            "agents": learning.agents,
-            "training steps": learning.train_steps,
-        }
-        known = (f"{x:,.0f} {unit}" for unit, x in costs.items() if x is not None)
-        facts["cost of the run"] = ", ".join(known)
-        only = " (all of them tests)" if proxy.kind == "se" and not proxy.is_distilled else ""
-        facts["steps on the real task"] = f"{learning.real_steps:,}{only}"
-    return facts
 
 
 def _words_of_best(proxy: PretrainedProxy) -> str:
     """Overrides of `sejax.evaluate` that train the agents which learned best."""
-    best = max(proxy.on_proxy, key=lambda each: each.return_mean, default=None)
+    best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     if best is None:
         return ""
     if best.hparams == "as_learned":
@@ -370,11 +336,8 @@ def push(
     hub.require_repo(repo)
     stored = header.read(source, single=True)
     proxy = describe(stored, name=repo.rpartition("/")[2])
-    needs = [
-        argument
-        for group, argument in (("env", "task"), ("proxy", "proxy"))
-        if not header.is_registered(group, stored.header.config[group])
-    ]
+    config = stored.header.config
+    needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     address = f"{hub.SCHEME}{repo}"
     card = _front_matter(proxy, license) + card_of(proxy, address, needs, license)
     files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}

@@ -10,12 +10,15 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
+STYLE: Any = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def learning_curve(
@@ -31,15 +34,15 @@ def learning_curve(
     """
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
-    with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
-        steps = [x for name, x in data.items() if name.startswith("train_steps_mean")]
-        heights = (2, 1) if any(map(_varies, steps)) else (2,)
+    agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
+    has_steps = any(map(_varies, (x for name, x in data.items() if "train_steps_mean" in name)))
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            len(heights),
+            1 + has_steps,
             squeeze=False,
-            figsize=(7, 1 + 1.5 * sum(heights)),
+            figsize=(7, 5.5 if has_steps else 4),
             sharex=True,
-            height_ratios=heights,
+            height_ratios=(2, 1)[: 1 + has_steps],
             layout="constrained",
         )
         top, bottom = axes[0, 0], axes[-1, 0]
@@ -48,11 +51,10 @@ def learning_curve(
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
-        agents = [name for name in data if name.startswith("incumbent_mean_")]
-        for name, color in zip(agents, itertools.cycle(AGENTS)):
-            agent = name.removeprefix("incumbent_mean_")
-            top.plot(x, data[name], color=color, lw=1.3, ls="-.", label=f"incumbent: {agent}")
-            if bottom is not top:
+        for agent, color in zip(agents, itertools.cycle(AGENTS)):
+            label = f"incumbent: {agent}"
+            top.plot(x, data[f"incumbent_mean_{agent}"], color=color, lw=1.3, ls="-.", label=label)
+            if has_steps:
                 bottom.plot(x, data[f"train_steps_mean_{agent}"], color=color, lw=1, ls="-.")
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
@@ -61,10 +63,10 @@ def learning_curve(
         top.set_title(title)
         top.legend(frameon=False, fontsize=9, loc="best")
         bottom.set_xlabel("generation")
-        if bottom is not top:
+        if has_steps:
             bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
             bottom.set_ylabel("training steps\nof an agent")
-            bottom.set_ylim(0, max(1.1 * np.nanmax(steps), 1.0))
+            bottom.set_ylim(bottom=0)
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
@@ -87,54 +89,45 @@ def evaluation(
       title: who was trained.
     """
     worlds, keys = (list(dict.fromkeys(names)) for names in zip(*tables, strict=True))
-    width = len(keys) + (0.5 if len(keys) > 1 else 0)
-    places = {(world, key): width * worlds.index(world) + keys.index(key) for world, key in tables}
     panels = {"test_return": "return on the real task"}
     for column in ("train_steps", "train_episodes"):
         if _varies(np.concatenate([table[column] for table in tables.values()])):
             panels[column] = column.replace("train_", "training ")
-    rng = np.random.default_rng(0)
-    with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
-        figure, axes = plt.subplots(
-            1,
-            len(panels),
-            squeeze=False,
-            figsize=(len(panels) * (3 + 0.8 * (len(keys) - 1)), 3.4),
-            layout="constrained",
+    with plt.rc_context(STYLE):
+        width = 3 + 0.8 * (len(keys) - 1)
+        figure, (axes,) = plt.subplots(
+            1, len(panels), squeeze=False, figsize=(len(panels) * width, 3.4), layout="constrained"
         )
         figure.suptitle(title, fontsize=11)
-        for axis, (column, label) in zip(axes[0], panels.items(), strict=True):
+        for axis, (column, label) in zip(axes, panels.items(), strict=True):
             for (world, key), table in tables.items():
-                index, values = places[world, key], np.asarray(table[column], float)
-                color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
-                if len(keys) > 1:
-                    color = AGENTS[keys.index(key) % len(AGENTS)]
-                jitter = index + rng.uniform(-0.15, 0.15, len(values))
-                axis.plot(jitter, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
-                axis.plot(
-                    [index - 0.28, index + 0.28],
-                    [values.mean()] * 2,
-                    color=color,
-                    lw=2.5,
-                    label=key if world == worlds[0] else None,
-                )
-                axis.annotate(
-                    f"{values.mean():,.1f}" if column == "test_return" else f"{values.mean():,.0f}",
-                    (index + 0.3, values.mean()),
-                    fontsize=9,
-                    va="center",
-                )
-            middles = [np.mean([places[world, key] for key in keys]) for world in worlds]
+                place = worlds.index(world) * (len(keys) + 0.5) + keys.index(key)
+                color = AGENTS[keys.index(key) % len(AGENTS)]
+                if len(keys) == 1:
+                    color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
+                _strip(axis, place, np.asarray(table[column], float), color)
+            middles = [i * (len(keys) + 0.5) + (len(keys) - 1) / 2 for i in range(len(worlds))]
             axis.set_xticks(middles, [f"trained on\n{world}" for world in worlds])
-            axis.set_xlim(-0.6, max(places.values()) + 0.9)
+            axis.margins(x=0.2)
             axis.set_title(label, fontsize=10)
             if column != "test_return":
                 axis.set_ylim(bottom=0)
         if len(keys) > 1:
-            axes[0, 0].legend(frameon=False, fontsize=9)
+            lines = [Line2D([], [], color=color) for _, color in zip(keys, itertools.cycle(AGENTS))]
+            axes[0].legend(lines, keys, frameon=False, fontsize=9)
         if solved_reward is not None:
-            axes[0, 0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+            axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
+
+
+def _strip(axis: Axes, place: float, values: np.ndarray, color: str) -> None:
+    """A point for each agent above a place of the axis, and their mean as a line and a number."""
+    spread = place + np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
+    axis.plot(spread, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
+    mean = values.mean()
+    axis.hlines(mean, place - 0.28, place + 0.28, color=color, lw=2.5)
+    text = f"{mean:,.0f}" if abs(mean) >= 1000 else f"{mean:,.1f}"
+    axis.annotate(text, (place + 0.3, mean), fontsize=9, va="center")
 
 
 def _varies(numbers: np.ndarray) -> bool:

@@ -1,27 +1,26 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sejax.options import registry
-from sejax.runs import next_steps, preset_files
+from sejax.runs import preset_files
 from sejax.runs.config import LearnConfig
 from sejax.runs.trackers import FinishedGeneration, Reporter
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
     from sejax.bilevel import Bilevel
     from sejax.runs.run_directory import RunDirectory
+
+
+def _live_line(console: Console, text: str, **options: Any) -> Progress:
+    """One line that changes on a terminal, and nothing elsewhere."""
+    columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn(text), TextColumn("left")
+    left = TimeRemainingColumn(elapsed_when_finished=False)
+    return Progress(*columns, left, console=console, disable=not console.is_terminal, **options)
 
 
 class Tally:
@@ -35,22 +34,13 @@ class Tally:
       training 20 agents on the proxy ...
     """
 
-    def __init__(self, total: int, things: str, console: Console | None = None):
-        console = console or Console(highlight=False, markup=False)
+    def __init__(self, total: int, things: str):
+        console = Console(highlight=False, markup=False)
         self.is_live = console.is_terminal
         if not self.is_live:
             print(f"training {total:,} {things} ...", flush=True)
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.description}"),
-            BarColumn(bar_width=16),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not self.is_live,
-            transient=True,
-        )
+        counted = "{task.completed:,.0f}/{task.total:,.0f} {task.description}"
+        self._progress = _live_line(console, counted, transient=True)
         self._task = self._progress.add_task(things, total=total)
         self._total = total
 
@@ -74,26 +64,17 @@ class RunProgress(Reporter):
     def __init__(self, config: LearnConfig):
         self._config = config
         self._console = Console(highlight=False, markup=False)
-        self._live = self._console.is_terminal
-        self._progress = Progress(
-            SpinnerColumn(),
-            BarColumn(bar_width=16),
-            TextColumn("{task.description}"),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=False),
-            console=self._console,
-            disable=not self._live,
-        )
+        self._progress = _live_line(self._console, "{task.description}")
         self._task = self._progress.add_task("", total=config.generations)
         self._started, self._steps = time.monotonic(), 0
 
     def __enter__(self) -> "RunProgress":
         self._progress.start()
-        pair = self._config.name("env"), self._config.name("proxy")
-        if not preset_files.is_tuned(*pair):
+        env, proxy = self._config.name("env"), self._config.name("proxy")
+        if not preset_files.is_tuned(env, proxy):
             self.say(
-                f"There are no tuned settings for env={pair[0]} with proxy={pair[1]}: these are "
-                f"general ones, not tuned (docs/defaults.md)."
+                f"There are no tuned settings for env={env} with proxy={proxy}: these are general "
+                "ones, not tuned (docs/defaults.md)."
             )
         return self
 
@@ -107,7 +88,7 @@ class RunProgress(Reporter):
         """Shows what is being done before the first generation."""
         self._progress.update(self._task, description=text)
         self._started = time.monotonic()
-        if not self._live:
+        if not self._console.is_terminal:
             self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
@@ -118,48 +99,36 @@ class RunProgress(Reporter):
         """Shows the numbers of a generation; steps per second are the session's so far."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
-        values = info.values
+        values, means = info.values, ""
+        if len(self._config.scored_agents) > 1:
+            each = (f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in self._config.scored_agents)
+            means = f" ({', '.join(each)})"
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
-            f"incumbent {self._score(values['incumbent_mean'])} ± "
-            f"{self._score(values['incumbent_std'])}{self._of_agents(values)}, "
-            f"best {self._score(values['best_so_far'])}, "
+            f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
+            f"{means}, best {values['best_so_far']:.1f}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         if values["num_nonfinite"]:
             text += f", {values['num_nonfinite']:.0f} diverged"
         self._progress.update(self._task, completed=info.generation + 1, description=text)
-        if not self._live:
+        if not self._console.is_terminal:
             self.say(text)
 
-    def _score(self, score: float) -> str:
-        return f"{score:.1f}"
-
-    def _of_agents(self, values: Mapping[str, float]) -> str:
-        """The incumbent's mean for each of several agents."""
-        keys = self._config.scored_agents
-        each = [
-            f"{key} {self._score(values[f'incumbent_mean_{key}'])}" for key in keys if len(keys) > 1
-        ]
-        return f" ({', '.join(each)})" if each else ""
-
-    def finish(
-        self, directory: "RunDirectory", learner: "Bilevel", best: float, ended: str
-    ) -> None:
+    def finish(self, directory: "RunDirectory", learner: "Bilevel", best: float) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        title, verdict = "learned", f"best incumbent score {self._score(best)}"
+        title, verdict = "learned", f"best incumbent score {best:.1f}"
         if learner.scoring.objective.meaning:
             verdict += f": {learner.scoring.objective.meaning}"
         if learner.solved_score is not None:
-            solved = "solved" if best >= learner.solved_score else "not solved"
-            title = "solved" if solved == "solved" else title
+            is_solved = best >= learner.solved_score
+            title = "solved" if is_solved else "learned"
             verdict = (
-                f"{solved}: best incumbent mean {best:.1f}, solved at {learner.solved_score:g}"
+                f"{'solved' if is_solved else 'not solved'}: best incumbent mean {best:.1f}, "
+                f"solved at {learner.solved_score:g}"
             )
-        path, config = directory.path, self._config
-        agents = [registry.name_of("agent", each) for each in config.agents.values()]
-        words = next_steps.evaluate_words(path, config.name("env"), config.name("proxy"), agents)
+        path = directory.path
         self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"
@@ -167,13 +136,24 @@ class RunProgress(Reporter):
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             "Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate {' '.join(words)}\n"
+            f"  python -m sejax.evaluate proxy={path}{self._plugin_words()} num_agents=20\n"
             f"Use it as a gymnax environment:\n"
-            f'  env, params = sejax.load("{path}"{self._own_arguments()})'
+            f'  env, params = sejax.load("{path}"{self._plugin_arguments()})'
         )
 
-    def _own_arguments(self) -> str:
-        """What `sejax.load` must be given beside the proxy: what no file's name is imported for."""
+    def _plugin_words(self) -> str:
+        """The overrides that name plugins, which `sejax.evaluate` imports only if it is told to."""
+        env, proxy = self._config.name("env"), self._config.name("proxy")
+        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
+        words = f" env={env}" if ":" in env else ""
+        words += f" proxy_kind={proxy}" if ":" in proxy else ""
+        if any(":" in name for name in agents):
+            several = f"agents=[{','.join(agents)}]"
+            words += f" {several}" if len(agents) > 1 else f" agent={agents[0]}"
+        return words
+
+    def _plugin_arguments(self) -> str:
+        """The arguments of `sejax.load` for plugins, as no name in a file is imported."""
         env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
         fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
         task = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""

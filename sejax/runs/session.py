@@ -17,8 +17,9 @@ from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.ops.parallel import compiler_options
+from sejax.proxies.header import agents_of
 from sejax.proxies.io import save
-from sejax.runs import next_steps, plots, runtime
+from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
@@ -122,20 +123,18 @@ def run(
       ConfigError: if the folder's state is that of another version.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    report = report or Reporter()
-    learner, clock = chunks.learner, _Clock(directory, chunks)
-    proxies = _Proxies(config, directory, learner)
+    report, learner = report or Reporter(), chunks.learner
+    start_wall_s = directory.wall_s - time.monotonic()
+    start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = chunks.init(jax.random.key(config.seed))
     restored = directory.restore(state)
+    best_on_disk = None
     if restored is not None:
         # `stop_when_solved` may have changed.
         solved = jax.numpy.bool_(learner.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
-        report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
-        here = runtime.versions()
-        if directory.versions != here:
-            report.say(f"It was made with {directory.versions}; here are {here}. Numbers may move.")
-        proxies.save(jax.device_get(state))
+        _say_what_is_resumed(directory, report)
+        best_on_disk = save_proxies(directory, learner, jax.device_get(state), best_on_disk)
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     tracked = TrackedRun(
         folder=directory.path.resolve(),
@@ -143,26 +142,20 @@ def run(
         generation=directory.finished_generations,
         config=directory.config,
     )
-    tracker = GuardedTracker(config.tracker, tracked, report.say)
     drawn = time.monotonic()
-    with contextlib.closing(tracker):
+    with contextlib.closing(GuardedTracker(config.tracker, tracked, report.say)) as tracker:
         while directory.finished_generations < config.generations and not state.solved:
             if _all_diverged(directory, learner):
                 break
             left = config.generations - directory.finished_generations
             length = min(config.checkpoint_every, left)
-            if not chunks.is_ready(length):
-                report.status("compiling")
-                chunks.compile(length)
-                report.status("first generation")
-            state, info = chunks.advance(state, length)
-            pending: Any = state.generation
-            while not pending.is_ready():  # Ctrl-C is heard in Python alone
-                time.sleep(0.02)
+            state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
-                rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
-                proxies.save(saved)
+                wall_s = start_wall_s + time.monotonic()
+                cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
+                rows = directory.save(saved, info, wall_s, cpu_s)
+                best_on_disk = save_proxies(directory, learner, saved, best_on_disk)
                 for generation in _finished(rows, info):
                     report.on_generation(generation)
                     tracker.on_generation(generation)
@@ -172,23 +165,52 @@ def run(
         draw(directory, learner)
     diverged = _all_diverged(directory, learner)
     ended = "solved" if state.solved else "diverged" if diverged else "finished"
-    agents = learner.strategy.num_evaluations  # of a generation
-    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
-        generations=directory.finished_generations,
         solved_score=learner.solved_score,
-        wall_s=round(clock.wall_s(), 1),
-        cpu_s=round(clock.cpu_s(), 1),
-        agents=directory.finished_generations * agents,
-        train_steps=round(steps_of_agents * agents),
-        real_steps=directory.real_steps,
+        wall_s=round(start_wall_s + time.monotonic(), 1),
+        cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
+        **_costs(directory, learner),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     )
     return ended
+
+
+def _advance(
+    chunks: Chunks, state: LearnState, length: int, report: Reporter
+) -> tuple[LearnState, GenerationInfo]:
+    """Runs `length` generations, and returns when they are computed."""
+    if not chunks.is_ready(length):
+        report.status("compiling")
+        chunks.compile(length)
+        report.status("first generation")
+    state, info = chunks.advance(state, length)
+    pending: Any = state.generation
+    while not pending.is_ready():  # Ctrl-C is heard in Python alone
+        time.sleep(0.02)
+    return state, info
+
+
+def _say_what_is_resumed(directory: RunDirectory, report: Reporter) -> None:
+    report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
+    here = runtime.versions()
+    if directory.versions != here:
+        report.say(f"It was made with {directory.versions}; here are {here}. Numbers may move.")
+
+
+def _costs(directory: RunDirectory, learner: Bilevel) -> dict[str, int]:
+    """What all sessions of a run took, as counts."""
+    agents = learner.strategy.num_evaluations  # of a generation
+    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
+    return {
+        "generations": directory.finished_generations,
+        "agents": directory.finished_generations * agents,
+        "train_steps": round(steps_of_agents * agents),
+        "real_steps": directory.real_steps,
+    }
 
 
 def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
@@ -208,11 +230,12 @@ def interrupts_held() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
     heard: list[int] = []
-    for number in handlers:
-        signal.signal(number, lambda number, frame: heard.append(number))
+    handlers = {
+        number: signal.signal(number, lambda number, frame: heard.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if callable(signal.getsignal(number))
+    }
     try:
         yield
     finally:
@@ -222,72 +245,58 @@ def interrupts_held() -> Iterator[None]:
         signal.raise_signal(heard[0])
 
 
-class _Clock:
-    """Seconds of all sessions of a run; no change of the machine's time moves them."""
+def save_proxies(
+    directory: RunDirectory, learner: Bilevel, state: LearnState, best_on_disk: int | None
+) -> int | None:
+    """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
-    def __init__(self, directory: RunDirectory, chunks: Chunks):
-        self._chunks = chunks
-        self._wall_s = directory.wall_s - time.monotonic()
-        self._cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
+    Where the search mean has diverged, the file before it stays.
 
-    def wall_s(self) -> float:
-        return self._wall_s + time.monotonic()
+    Args:
+      directory: of the run.
+      learner: the functions of Algorithm 1.
+      state: after the last generation that is saved, on the host.
+      best_on_disk: the generation of the best proxy that this session has written.
 
-    def cpu_s(self) -> float:
-        return self._cpu_s + time.process_time() + self._chunks.cpu_s
+    Returns:
+      The same after this call.
 
-
-class _Proxies:
-    """The proxy files of a run."""
-
-    def __init__(self, config: LearnConfig, directory: RunDirectory, learner: Bilevel):
-        self._directory, self._learner, self._seed = directory, learner, config.seed
-        # What was learned does not depend on the tracker, nor on where it was computed.
-        plain = directory.config.items()
-        self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
-        agent = learner.scoring.mixture.agents[0]
-        discount = agent.discount(agent.hparams)
-        self._discount = None if discount is None else float(discount)
-        self._best: int | None = None  # the generation of the best proxy that is on the disk
-
-    def save(self, state: LearnState) -> None:
-        """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
-
-        Raises:
-          OSError: if a file cannot be written.
-        """
-        if _all_diverged(self._directory, self._learner):
-            return
-        if self._best != state.best_generation:
-            best = state.best, state.best_score, state.best_scores, state.best_generation
-            self._save("proxy", *best)
-            self._best = int(state.best_generation)
-        last = state.incumbent, state.incumbent_score, state.incumbent_scores
-        self._save("proxy_last", *last, state.generation - 1)
-
-    def _save(self, name: str, flat: Array, score: Array, scores: Array, generation: Array) -> None:
-        if not np.isfinite(flat).all():  # the mean has diverged; the file before it stays
-            return
-        names = self._learner.scoring.mixture.names
+    Raises:
+      OSError: if a file cannot be written.
+    """
+    if _all_diverged(directory, learner):
+        return best_on_disk
+    best = state.best, state.best_score, state.best_scores, state.best_generation
+    last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
+    first_agent, names = learner.scoring.mixture.agents[0], learner.scoring.mixture.names
+    discount = first_agent.discount(first_agent.hparams)
+    # What was learned does not depend on the tracker, nor on where it was computed.
+    config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
+    for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
+        is_there = name == "proxy" and best_on_disk == generation
+        if is_there or not np.isfinite(flat).all():
+            continue
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
-            self._directory.path / f"{name}.safetensors",
-            self._learner.proxy,
-            self._learner.unravel(flat),
-            self._plain,
-            self._discount,
+            directory.path / f"{name}.safetensors",
+            learner.proxy,
+            learner.unravel(flat),
+            config,
+            None if discount is None else float(discount),
             score=float(score),
             generation=int(generation),
-            seed=self._seed,
+            seed=directory.config["seed"],
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
+    return int(state.best_generation)
 
 
 def draw(directory: RunDirectory, learner: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
-        path = directory.path / "learning_curve.png"
-        title = next_steps.title(directory.config)
+        path, config = directory.path / "learning_curve.png", directory.config
+        title = f"{config['env']['name']}, {str(config['proxy']['name']).upper()}, "
+        title += " + ".join(agent["name"] for agent in agents_of(config).values())
         plots.learning_curve(directory.rows, learner.solved_score, path, title)
 
 

@@ -172,7 +172,7 @@ class TensorBoard:
 
 @dataclass(frozen=True, kw_only=True)
 class WandbConfig:
-    """A run of Weights & Biases; offline with `WANDB_MODE=offline`, or where it cannot log in."""
+    """A run of Weights & Biases; offline with `WANDB_MODE=offline`."""
 
     package: ClassVar[str] = "wandb"
     project: str = "sejax"
@@ -180,23 +180,17 @@ class WandbConfig:
     def make(self, run: TrackedRun) -> "Wandb":
         import wandb
 
-        # The console belongs to the progress line; by default wandb waits 90 s for a network.
-        settings = wandb.Settings(console="off", init_timeout=20)
-        options: Any = {
-            "project": self.project,
-            "name": run.folder.name,
-            "id": run.id,
-            "resume": "allow",
-            "dir": str(run.folder),
-            "config": run.config,
-            "settings": settings,
-        }
-        try:
-            return Wandb(run, wandb, wandb.init(**options))
-        except wandb.errors.Error as error:
-            wandb.termwarn(f"{told(error)}: the run is kept offline, for `wandb sync`.")
-            wandb.teardown()
-            return Wandb(run, wandb, wandb.init(mode="offline", **options))
+        logged = wandb.init(
+            project=self.project,
+            name=run.folder.name,
+            id=run.id,
+            resume="allow",
+            dir=str(run.folder),
+            config=run.config,
+            # The console belongs to the progress line; by default wandb waits 90 s for a network.
+            settings=wandb.Settings(console="off", init_timeout=20),
+        )
+        return Wandb(run, wandb, logged)
 
 
 class Wandb:

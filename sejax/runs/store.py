@@ -1,0 +1,155 @@
+"""What a computation keeps in a folder to go on after a kill, and only with the same settings.
+
+Each entry is one file, `NAME.safetensors`, with a checksum and the settings that it was made with.
+It is written to a temporary file, put on the disk, and renamed over the one before: a kill at any
+moment leaves a whole entry, this one or the one before.
+"""
+
+import json
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sejax.ops import checksummed
+from sejax.ops.files import FolderLock, write_bytes
+from sejax.options import ConfigError
+from sejax.options.plain import differences
+
+KIND, FORMAT_VERSION = "sejax_run", 1  # of the files, since the first release
+
+
+class Entry(NamedTuple):
+    """What a store holds under a name.
+
+    Attributes:
+      tensors: arrays by name.
+      values: plain values by name.
+    """
+
+    tensors: dict[str, np.ndarray]
+    values: dict[str, Any]
+
+
+class Store:
+    """Entries of the same settings in a folder; within `with`, this process alone uses it.
+
+    Args:
+      folder: the folder, made with the first entry or lock.
+      settings: plain values in nested mappings, on which all entries depend.
+      field: the field that names the folder, for messages.
+      hint: last sentence of messages: how to choose another folder.
+      free: groups and fields of the first level that may differ: how to compute, not what.
+      completed: adds to stored settings the fields that an older version did not write.
+
+    Attributes:
+      settings: as they are stored, with lists in the place of tuples.
+
+    Example:
+      >>> import tempfile
+      >>> folder = Path(tempfile.mkdtemp())
+      >>> with Store(folder, {"seed": 0}) as store:
+      ...     store.put("rounds", {"x": np.arange(2)}, count=2)
+      >>> Store(folder, {"seed": 0}).get("rounds").values
+      {'count': 2}
+      >>> Store(folder, {"seed": 1}).get("rounds")  # doctest: +IGNORE_EXCEPTION_DETAIL
+      Traceback (most recent call last):
+      sejax.options.ConfigError: run_dir must be new ... seed (0 there, 1 here). Set run_dir=FOLDER.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        *,
+        field: str = "run_dir",
+        hint: str = "",
+        free: Collection[str] = (),
+        completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
+    ):
+        self.folder = folder
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings))
+        self._field, self._hint = field, hint or f"Set {field}=FOLDER."
+        self._free, self._completed = free, completed
+        self._lock: FolderLock | None = None
+        self._is_used = False
+
+    def __enter__(self) -> "Store":
+        self.lock()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def lock(self) -> None:
+        """Makes the folder, and keeps other processes out of it until `release`.
+
+        Raises:
+          ConfigError: if another process uses it, or it cannot be written.
+        """
+        self._lock = FolderLock(self.folder, self._hint, self._field)
+
+    def release(self) -> None:
+        """Lets other processes use the folder; leaves nothing behind if it has no entry."""
+        if self._lock is not None:
+            self._lock.release(self._is_used)
+
+    def path(self, name: str) -> Path:
+        """The file of an entry."""
+        return self.folder / f"{name}.safetensors"
+
+    def get(self, name: str) -> Entry | None:
+        """An entry; None if there is none of this name.
+
+        Raises:
+          ConfigError: if it is damaged, or was made with other settings.
+        """
+        try:
+            tensors, values = checksummed.read(self.path(name), KIND)
+            version, stored = values.pop("format_version"), dict(values.pop("config"))
+            if version != FORMAT_VERSION:
+                raise ValueError(f"its format is {version}")
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise self.damaged(name, error) from error
+        self._is_used = True
+        differing = differences(stored, self.settings, self._free, most=3)
+        if differing:
+            differing = differences(self._completed(stored), self.settings, self._free, most=3)
+        if differing:
+            raise self.refused(
+                f"must be new or hold what was made with the same settings; got {self.folder}, "
+                f"which differs in {differing}"
+            )
+        return Entry(tensors, values)
+
+    def put(
+        self, name: str, tensors: Mapping[str, np.ndarray] | None = None, **values: object
+    ) -> None:
+        """Writes an entry over the one of this name.
+
+        Args:
+          name: of the entry.
+          tensors: arrays by name.
+          **values: plain values.
+
+        Raises:
+          OSError: if it cannot be written, or the folder was removed since it was locked; the entry
+            before is then whole.
+        """
+        if self._lock is not None and not (self.folder / FolderLock.NAME).exists():
+            raise FileNotFoundError(f"{self.folder} was removed while it was in use")
+        manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
+        write_bytes(self.path(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
+        self._is_used = True
+
+    def damaged(self, name: str, error: Exception) -> ConfigError:
+        """The error for an entry that cannot be read, and why."""
+        self._is_used = True
+        return self.refused(f"must hold whole files; got {self.path(name)}: {error}")
+
+    def refused(self, message: str) -> ConfigError:
+        """The error for a folder that cannot be used; the message follows its field."""
+        return ConfigError(f"{self._field} {message}. {self._hint}", self._field)
