@@ -311,13 +311,6 @@ def test_malformed_calls_are_errors_that_say_what_must_hold(changed, said):
         call(**changed)
 
 
-def test_wrong_shapes_are_refused_while_tracing():
-    physics = of_gymnasium("hopper.xml", 4)
-    state, _ = physics.reset(jnp.zeros(6), jnp.zeros(6))
-    with pytest.raises(ValueError, match=r"must get arrays of shape \(3,\); got \(4,\)"):
-        physics.step(state, jnp.zeros(4))
-
-
 def no_compiler(patch):
     patch.setenv("CXX", "no-such-compiler")
     patch.setattr(library, "COMPILERS", ("none-either",))

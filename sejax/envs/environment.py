@@ -40,7 +40,8 @@ Step = tuple[Array, State, Array, Array, dict[str, Array]]  # obs, state, reward
 class Environment(Generic[State, Params]):
     """An environment whose `step_env` and `reset_env` act on one element.
 
-    A subclass adds `start` and `observe` (or `reset_env`), `step_env` and `is_terminated`.
+    A subclass adds `start` and `observe` (or `reset_env`) and `step_env`; where episodes terminate
+    by their states, `is_terminated`, too.
 
     Args:
       spec: its spaces, and the step limit of `default_params`.
@@ -79,7 +80,8 @@ class Environment(Generic[State, Params]):
         raise NotImplementedError
 
     def is_terminated(self, state: State, params: Params) -> Bool[Array, ""]:
-        raise NotImplementedError
+        """Whether a state is terminal; False where a step alone can tell, or none is."""
+        return jnp.bool_(False)
 
     def is_truncated(self, state: State, params: Params) -> Bool[Array, ""]:
         """Whether the step limit is reached."""

@@ -31,11 +31,8 @@ def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv[MujocoTask
         import gymnasium  # noqa: F401, whose models are read
         import mujoco  # noqa: F401
     except ImportError as error:
-        raise ConfigError(
-            f"{field} needs MuJoCo and Gymnasium; {error}. Install them with pip install "
-            f"'sejax[mujoco]'{otherwise}.",
-            "env",
-        ) from error
+        fix = f"Install them with pip install 'sejax[mujoco]'{otherwise}."
+        raise ConfigError(f"{field} needs MuJoCo and Gymnasium; {error}. {fix}", "env") from error
     import jax
 
     from sejax.envs.mujoco import library, models
@@ -46,8 +43,7 @@ def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv[MujocoTask
     try:
         library.load()
     except library.BuildError as error:
-        raise ConfigError(
-            f"{field} needs a library of its own; {error}{otherwise}.", "env"
-        ) from error
+        message = f"{field} needs a library of its own; {error}{otherwise}."
+        raise ConfigError(message, "env") from error
     env: MujocoEnv[MujocoTask] = getattr(models, config.model)(config)
     return env

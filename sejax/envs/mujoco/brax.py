@@ -7,7 +7,7 @@ from brax.base import State as BraxState
 from brax.envs.base import State
 from brax.envs.half_cheetah import Halfcheetah
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 
@@ -41,10 +41,9 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
 
     def __init__(self, config: "HalfCheetah"):
         super().__init__(config.spec)
-        self.backend = config.backend
         self._info_keys = config.spec.info_keys
-        self._brax = Halfcheetah(backend=self.backend)
-        if self.backend == "mjx":
+        self._brax = Halfcheetah(backend=config.backend)
+        if config.backend == "mjx":
             self._brax.sys = self._brax.sys.tree_replace({"opt.ls_iterations": LS_ITERATIONS})
 
     def reset_env(self, key: Array, params: EnvParams) -> tuple[Float[Array, "17"], CheetahState]:
@@ -62,10 +61,3 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
         info = {**after.metrics, "discount": jnp.float32(1)}
         state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
         return after.obs, state, after.reward, jnp.bool_(False), info
-
-    def is_terminated(self, state: CheetahState, params: EnvParams) -> Bool[Array, ""]:
-        return jnp.bool_(False)
-
-    @property
-    def name(self) -> str:
-        return f"HalfCheetah-{self.backend}"

@@ -27,8 +27,8 @@ class MujocoState(EnvState):
 class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
     """A task of Gymnasium, equal to it step by step but for rounding to single precision.
 
-    A subclass says what is in the class attributes and in the methods `observe_report`,
-    `is_healthy`, `rewards` and `more_info`. As in Gymnasium, the reward is the sum of the parts
+    A subclass says what is in the class attributes and in the methods `rewards`, `is_healthy`,
+    `more_info` and `observe_report`. As in Gymnasium, the reward is the sum of the parts
     that `info` lists, and actions beyond their bounds are clipped by MuJoCo and charged as they
     are.
 
@@ -37,9 +37,9 @@ class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
       physics: of its model.
     """
 
-    gymnasium_id: ClassVar[str]
     file: ClassVar[str]  # of the model, among Gymnasium's
     frame_skip: ClassVar[int]
+    num_hidden: ClassVar[int]  # positions that are not observed, the first ones
     with_forces: ClassVar[bool] = False  # whether external forces are needed
     normal_velocities: ClassVar[bool] = False  # those of a reset, else uniform
 
@@ -62,8 +62,8 @@ class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
         return qpos, jax.random.uniform(key_qvel, (nv,), minval=-scale, maxval=scale)
 
     def observe_report(self, now: Report) -> Float[Array, " obs_dim"]:
-        """The observation."""
-        raise NotImplementedError
+        """The observation: positions and velocities."""
+        return jnp.concatenate([now.qpos[self.num_hidden :], now.qvel])
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
         """Whether the episode can go on, for tasks that terminate."""
@@ -79,9 +79,9 @@ class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
         """What else is in `info`."""
         return {}
 
-    def x_velocity(self, now: Report) -> Float[Array, ""]:
-        """In the step, in m/s."""
-        return now.qpos_change[0] / self.physics.dt
+    def velocity(self, now: Report) -> Float[Array, " axes"]:
+        """The body's velocity in the step along x and further axes, in m/s."""
+        return now.qpos_change / self.physics.dt
 
     def reset_env(
         self, key: Array, params: EnvParams
@@ -103,26 +103,18 @@ class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
         state = MujocoState(physics=after, time=state.time + 1)
         return self.observe_report(now), state, reward, terminated, info
 
-    def is_terminated(self, state: MujocoState, params: EnvParams) -> Bool[Array, ""]:
-        """False: whether a step terminates is known when it is made."""
-        return jnp.bool_(False)
-
-    @property
-    def name(self) -> str:
-        return self.gymnasium_id
-
 
 def control_cost(action: Float[Array, " nu"], weight: float) -> Float[Array, ""]:
     """The part of the reward that charges for control."""
     return -weight * jnp.sum(action**2)
 
 
-def plane(position: Float[Array, "2"], velocity: Float[Array, "2"]) -> Scalars:
-    """What Gymnasium's `info` has of a body that moves in a plane."""
+def plane(position: Float[Array, " axes"], velocity: Float[Array, " axes"]) -> Scalars:
+    """What Gymnasium's `info` has of a body that moves in a plane; x and y are the first axes."""
     return {
         "x_position": position[0],
         "y_position": position[1],
-        "distance_from_origin": jnp.linalg.norm(position),
+        "distance_from_origin": jnp.linalg.norm(position[:2]),
         "x_velocity": velocity[0],
         "y_velocity": velocity[1],
     }

@@ -50,8 +50,8 @@ def load() -> ctypes.CDLL:
 def _load() -> ctypes.CDLL:
     folder = files.cache_folder()
     kept = folder / file_name() if folder else None
-    with contextlib.suppress(OSError):
-        if kept is not None and kept.exists():
+    with contextlib.suppress(OSError):  # as where none lies there yet
+        if kept is not None:
             return _register(kept)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         built = Path(temporary) / file_name()
@@ -63,26 +63,17 @@ def _load() -> ctypes.CDLL:
         try:
             return _register(built)
         except OSError as error:
-            raise BuildError(
-                f"it cannot be loaded ({told(error)}). Set SEJAX_CACHE_DIR, or TMPDIR, to a folder "
-                "that programs can be run from"
-            ) from error
+            fix = "Set SEJAX_CACHE_DIR, or TMPDIR, to a folder that programs can be run from"
+            raise BuildError(f"it cannot be loaded ({told(error)}). {fix}") from error
 
 
 def file_name() -> str:
     """What the library is called: there is one for each version of all that it is made of."""
-    parts = (
-        SOURCE.read_text(encoding="utf-8"),
-        " ".join(FLAGS),
-        version("mujoco"),
-        version("jaxlib"),
-        platform.system(),
-        platform.machine(),
-        *platform.libc_ver(),
-        *_given_compiler()[1:],
-    )
+    versions = f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}"
+    source, options = SOURCE.read_text(encoding="utf-8"), (*FLAGS, *_given_compiler()[1:])
+    parts = (source, *options, versions, platform.system(), *platform.libc_ver())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
-    return f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}-{digest}.so"
+    return f"{versions}-{digest}.so"
 
 
 def build(path: Path) -> None:
@@ -95,28 +86,14 @@ def build(path: Path) -> None:
       BuildError: if there is no compiler, or it fails.
     """
     package = Path(mujoco.__file__).parent
-    libraries = sorted(
-        x for x in package.glob("libmujoco*") if x.suffix == ".dylib" or ".so" in x.name
-    )
-    if not libraries:
-        raise BuildError(f"{package} has no libmujoco. Install MuJoCo with pip install mujoco")
-    command = [
-        *_compiler(),
-        *FLAGS,
-        f"-I{package / 'include'}",
-        f"-I{jax.ffi.include_dir()}",
-        str(SOURCE),
-        str(libraries[0]),
-        "-o",
-        str(path),
-    ]
+    mujoco_library = min(package.glob("libmujoco*"))
+    includes = f"-I{package / 'include'}", f"-I{jax.ffi.include_dir()}"
+    command = [*_compiler(), *FLAGS, *includes, str(SOURCE), str(mujoco_library), "-o", str(path)]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = error if isinstance(error, OSError) else error.stderr.strip()
-        raise BuildError(
-            f"{command[0]} failed with: {shortened(said, 120)}. Mend that, or set CXX"
-        ) from error
+        said = shortened(error if isinstance(error, OSError) else error.stderr.strip(), 120)
+        raise BuildError(f"{command[0]} failed with: {said}. Mend that, or set CXX") from error
 
 
 def _compiler() -> list[str]:

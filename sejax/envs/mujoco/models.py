@@ -27,19 +27,16 @@ class HalfCheetahEnv(MujocoEnv["tasks.HalfCheetah"]):
     other physics do.
     """
 
-    gymnasium_id = "HalfCheetah-v5"
     file = "half_cheetah.xml"
     frame_skip = 5
+    num_hidden = 1
     normal_velocities = True
 
-    def observe_report(self, now: Report) -> Float[Array, "17"]:
-        return jnp.concatenate([now.qpos[1:], now.qvel])
-
     def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
-        return {"reward_run": self.x_velocity(now), "reward_ctrl": control_cost(action, 0.1)}
+        return {"reward_run": self.velocity(now)[0], "reward_ctrl": control_cost(action, 0.1)}
 
     def more_info(self, now: Report) -> Scalars:
-        return {"x_position": now.qpos[0], "x_velocity": self.x_velocity(now)}
+        return {"x_position": now.qpos[0], "x_velocity": self.velocity(now)[0]}
 
 
 Runner = TypeVar("Runner", bound="tasks.Runner")
@@ -50,7 +47,7 @@ class RunnerEnv(MujocoEnv[Runner]):
 
     def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
         return {
-            "reward_forward": self.config.forward_reward_weight * self.x_velocity(now),
+            "reward_forward": self.config.forward_reward_weight * self.velocity(now)[0],
             "reward_ctrl": control_cost(action, self.config.ctrl_cost_weight),
         }
 
@@ -65,7 +62,6 @@ class HopperEnv(RunnerEnv["tasks.Hopper"]):
     velocities, clipped to [-10, 10], `[11]`; actions torques, `[3]`.
     """
 
-    gymnasium_id = "Hopper-v5"
     file = "hopper.xml"
     frame_skip = 4
 
@@ -84,7 +80,7 @@ class HopperEnv(RunnerEnv["tasks.Hopper"]):
     def more_info(self, now: Report) -> Scalars:
         return {
             "x_position": now.qpos[0],
-            "x_velocity": self.x_velocity(now),
+            "x_velocity": self.velocity(now)[0],
             "z_distance_from_origin": now.qpos[1] - self._qpos0[1],
         }
 
@@ -98,7 +94,6 @@ class Walker2dEnv(HopperEnv):
     Observations are as the hopper's, `[17]`; actions torques, `[6]`.
     """
 
-    gymnasium_id = "Walker2d-v5"
     file = "walker2d_v5.xml"
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
@@ -115,15 +110,12 @@ class SwimmerEnv(RunnerEnv["tasks.Swimmer"]):
     `[2]`.
     """
 
-    gymnasium_id = "Swimmer-v5"
     file = "swimmer.xml"
     frame_skip = 4
-
-    def observe_report(self, now: Report) -> Float[Array, "8"]:
-        return jnp.concatenate([now.qpos[2:], now.qvel])
+    num_hidden = 2
 
     def more_info(self, now: Report) -> Scalars:
-        return plane(now.qpos[:2], now.qpos_change[:2] / self.physics.dt)
+        return plane(now.qpos, self.velocity(now))
 
 
 class InvertedPendulumEnv(MujocoEnv["tasks.InvertedPendulum"]):
@@ -133,12 +125,9 @@ class InvertedPendulumEnv(MujocoEnv["tasks.InvertedPendulum"]):
     velocities, `[4]`; the action is a force on the cart, `[1]` in [-3, 3].
     """
 
-    gymnasium_id = "InvertedPendulum-v5"
     file = "inverted_pendulum.xml"
     frame_skip = 2
-
-    def observe_report(self, now: Report) -> Float[Array, "4"]:
-        return jnp.concatenate([now.qpos, now.qvel])
+    num_hidden = 0
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
         return jnp.isfinite(self.observe_report(now)).all() & (jnp.abs(now.qpos[1]) <= 0.2)
@@ -161,17 +150,17 @@ class AntEnv(RunnerEnv["tasks.Ant"]):
     Gymnasium, the velocity is that of the torso as MuJoCo computed it last, a part of a step ago.
     """
 
-    gymnasium_id = "Ant-v5"
     file = "ant.xml"
     frame_skip = 5
+    num_hidden = 2
     with_forces = True
     normal_velocities = True
 
     def observe_report(self, now: Report) -> Float[Array, " obs_dim"]:
-        parts = [now.qpos[2:], now.qvel]
-        if self.config.include_cfrc_ext_in_observation:
-            parts.append(_forces(now)[1:].ravel())  # the world itself feels none
-        return jnp.concatenate(parts)
+        obs = super().observe_report(now)
+        if not self.config.include_cfrc_ext_in_observation:
+            return obs
+        return jnp.concatenate([obs, _forces(now)[1:].ravel()])  # the world itself feels none
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
         finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
@@ -186,13 +175,10 @@ class AntEnv(RunnerEnv["tasks.Ant"]):
         }
 
     def more_info(self, now: Report) -> Scalars:
-        return plane(now.qpos[:2], self._velocity(now))
+        return plane(now.qpos, self.velocity(now))
 
-    def x_velocity(self, now: Report) -> Float[Array, ""]:
-        return self._velocity(now)[0]
-
-    def _velocity(self, now: Report) -> Float[Array, "2"]:
-        return now.xpos_change[_TORSO, :2] / self.physics.dt
+    def velocity(self, now: Report) -> Float[Array, "3"]:
+        return now.xpos_change[_TORSO] / self.physics.dt
 
 
 def _forces(now: Report) -> Float[Array, "nbody 6"]:
@@ -211,7 +197,6 @@ class ReacherEnv(MujocoEnv["tasks.Reacher"]):
     joints' velocities, and what is between tip and target, `[10]`; actions torques, `[2]`.
     """
 
-    gymnasium_id = "Reacher-v5"
     file = "reacher.xml"
     frame_skip = 2
 

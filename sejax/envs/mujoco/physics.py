@@ -2,11 +2,11 @@
 
 import functools
 import hashlib
-import importlib.util
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -83,8 +83,8 @@ class Physics:
         self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]
     ) -> tuple[UInt32[Array, " num_words"], Report]:
         """A new simulation with these positions and velocities."""
-        qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
-        return self._call("sejax_mujoco_reset", (qpos, (self.model.nq,)), (qvel, (self.model.nv,)))
+        arguments = jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
+        return self._call("sejax_mujoco_reset", *arguments)
 
     def step(
         self, state: UInt32[Array, " num_words"], ctrl: Float[Array, " nu"]
@@ -94,23 +94,17 @@ class Physics:
         Controls of which one is not a number count as 0, as in MuJoCo. A simulation that explodes
         begins anew from the model's own pose, as there.
         """
-        ctrl = jnp.asarray(ctrl, jnp.float32)
-        arguments = (state, (self.num_words,)), (ctrl, (self.model.nu,))
+        arguments = state, jnp.asarray(ctrl, jnp.float32)
         return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))
 
-    def _call(
-        self, target: str, *arguments: tuple[Array, tuple[int, ...]], **attributes: np.int64
-    ) -> tuple[Array, Report]:
-        for array, shape in arguments:
-            if array.shape != shape:
-                raise ValueError(f"{target} must get arrays of shape {shape}; got {array.shape}")
+    def _call(self, target: str, *arguments: Array, **attributes: np.int64) -> tuple[Array, Report]:
         sizes = [int(np.prod(shape)) for shape in self._shapes.values()]
         results = (
             jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
             jax.ShapeDtypeStruct((sum(sizes),), jnp.float32),
         )
         call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
-        state, numbers = call(*(array for array, _ in arguments), model=self._id, **attributes)
+        state, numbers = call(*arguments, model=self._id, **attributes)
         parts = zip(self._shapes.items(), jnp.split(numbers, np.cumsum(sizes)[:-1]), strict=True)
         return state, Report(**{name: x.reshape(shape) for (name, shape), x in parts})
 
@@ -118,7 +112,5 @@ class Physics:
 @functools.cache
 def of_gymnasium(file: str, frame_skip: int, with_forces: bool = False) -> Physics:
     """The physics of one of the models that come with Gymnasium, such as `"hopper.xml"`."""
-    spec = importlib.util.find_spec("gymnasium")
-    assert spec is not None and spec.origin is not None
-    assets = Path(spec.origin).parent / "envs" / "mujoco" / "assets"
+    assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
     return Physics(assets / file, frame_skip, with_forces)

@@ -21,25 +21,12 @@ from sejax.options import ConfigError, Options, finite, not_negative, one_of, op
 # MuJoCo, at ten times its cost on a CPU (docs/halfcheetah.md).
 BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
 
-
+# The entries of `info` that describe the state alone; an observation has no position along x or y.
+_STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
 _ON_A_LINE = ("x_position", "x_velocity")
-_IN_A_PLANE = ("x_position", "y_position", "x_velocity", "y_velocity")
-_INFO_OF_WALKERS = (
-    *_ON_A_LINE,
-    "z_distance_from_origin",
-    "reward_forward",
-    "reward_ctrl",
-    "reward_survive",
-)
-_INFO_IN_A_PLANE = (
-    "x_position",
-    "y_position",
-    "distance_from_origin",
-    "x_velocity",
-    "y_velocity",
-    "reward_forward",
-    "reward_ctrl",
-)
+_REWARD_KEYS = ("reward_forward", "reward_ctrl")
+_INFO_OF_WALKERS = (*_ON_A_LINE, "z_distance_from_origin", *_REWARD_KEYS, "reward_survive")
+_INFO_IN_A_PLANE = (*_STATE_KEYS[:2], "distance_from_origin", *_STATE_KEYS[2:], *_REWARD_KEYS)
 
 
 def _spec(
@@ -50,7 +37,6 @@ def _spec(
     max_action: float = 1.0,
     max_steps: int = 1000,
     info_keys: tuple[str, ...] = (),
-    augmented_keys: tuple[str, ...] = (),
 ) -> TaskSpec:
     return TaskSpec(
         observation=Box.symmetric(*[math.inf] * obs_dim),
@@ -58,7 +44,7 @@ def _spec(
         max_steps=max_steps,
         solved_reward=solved_reward,
         info_keys=info_keys,
-        augmented_keys=augmented_keys,
+        augmented_keys=tuple(key for key in info_keys if key in _STATE_KEYS),
     )
 
 
@@ -97,18 +83,12 @@ class HalfCheetah(MujocoTask):
 
     name = "halfcheetah"
     model = "HalfCheetahEnv"
-    spec = _spec(
-        17,
-        6,
-        solved_reward=3000.0,
-        info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"),
-        augmented_keys=_ON_A_LINE,
-    )
+    spec = _spec(17, 6, solved_reward=3000.0, info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"))
 
-    backend: str = option(BACKENDS[0], one_of(BACKENDS), help="physics")
+    backend: str = option("mujoco", one_of(BACKENDS), help="physics")
 
     def make(self) -> Task:
-        if self.backend == BACKENDS[0]:
+        if self.backend == "mujoco":
             env = mujoco.make_env(self, ", or set env.backend=mjx")
             return Task.of(self.spec, name=self.name, env=env)
         try:
@@ -119,7 +99,7 @@ class HalfCheetah(MujocoTask):
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
             raise ConfigError(
-                f"env.backend must be {BACKENDS[0]} without brax; got {self.backend} ({error}). "
+                f"env.backend must be mujoco without brax; got {self.backend} ({error}). "
                 "Install brax with pip install 'sejax[brax]'.",
                 "env.backend",
             ) from error
@@ -141,7 +121,7 @@ class Hopper(Runner):
 
     name = "hopper"
     model = "HopperEnv"
-    spec = _spec(11, 3, solved_reward=3800.0, info_keys=_INFO_OF_WALKERS, augmented_keys=_ON_A_LINE)
+    spec = _spec(11, 3, solved_reward=3800.0, info_keys=_INFO_OF_WALKERS)
 
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
@@ -157,7 +137,7 @@ class Walker2d(Hopper):
 
     name = "walker2d"
     model = "Walker2dEnv"
-    spec = _spec(17, 6, solved_reward=4000.0, info_keys=_INFO_OF_WALKERS, augmented_keys=_ON_A_LINE)
+    spec = _spec(17, 6, solved_reward=4000.0, info_keys=_INFO_OF_WALKERS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +146,7 @@ class Swimmer(Runner):
 
     name = "swimmer"
     model = "SwimmerEnv"
-    spec = _spec(8, 2, solved_reward=360.0, info_keys=_INFO_IN_A_PLANE, augmented_keys=_IN_A_PLANE)
+    spec = _spec(8, 2, solved_reward=360.0, info_keys=_INFO_IN_A_PLANE)
 
     ctrl_cost_weight: float = 1e-4
 
@@ -202,7 +182,6 @@ class Ant(Runner):
             8,
             solved_reward=6000.0,
             info_keys=(*_INFO_IN_A_PLANE, "reward_contact", "reward_survive"),
-            augmented_keys=_IN_A_PLANE,
         )
 
 
