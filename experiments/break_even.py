@@ -174,29 +174,22 @@ def agents_text(value: float, low: float, high: float) -> str:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-    texts = {
-        "real steps to learn it": (count_text, "learning_steps"),
-        "students": (users_text, "student"),
-        "the same on the task": (users_text, "same"),
-        "tuned on the task": (users_text, "tuned"),
-        "tuned students": (users_text, "tuned_student"),
-        "agents until it pays": (paid_text, "break_even"),
-        "beside the same": (paid_text, "break_even_same"),
-        "by CPU seconds": (paid_text, "break_even_cpu"),
-        "a bandit by hand": (null_text, "by_hand"),
-        "a bandit of the best of four": (null_text, "best_of_four"),
-    }
     return pd.DataFrame(
-        [
-            {"proxy": row["proxy"]} | {title: text(row, of) for title, (text, of) in texts.items()}
-            for row in summary.to_dict("records")
-        ]
+        {
+            "proxy": row["proxy"],
+            "real steps to learn it": tables.known_text(row["learning_steps"], ",.0f"),
+            "students": users_text(row, "student"),
+            "the same on the task": users_text(row, "same"),
+            "tuned on the task": users_text(row, "tuned"),
+            "tuned students": users_text(row, "tuned_student"),
+            "agents until it pays": paid_text(row, "break_even"),
+            "beside the same": paid_text(row, "break_even_same"),
+            "by CPU seconds": paid_text(row, "break_even_cpu"),
+            "a bandit by hand": null_text(row, "by_hand"),
+            "a bandit of the best of four": null_text(row, "best_of_four"),
+        }
+        for row in summary.to_dict("records")
     )
-
-
-def count_text(row: Mapping[Any, Any], name: str) -> str:
-    """A count; empty if it is not known."""
-    return "" if np.isnan(row[name]) else f"{row[name]:,.0f}"
 
 
 def users_text(row: Mapping[Any, Any], role: str) -> str:

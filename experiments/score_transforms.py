@@ -19,7 +19,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import matplotlib.pyplot as plt
@@ -106,10 +106,10 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
     """Runs of one score transform, a row each."""
     keys = jax.random.split(jax.random.key(settings.seed), settings.runs)
     step_sizes = draw_step_sizes(settings.runs, settings.seed)
-    search = make_search(transform, mirrored, settings.population, settings.devices)
-    state = search.init(keys, np.float32(step_sizes))
+    init, advance = make_search(transform, mirrored, settings.population, settings.devices)
+    state = init(keys, np.float32(step_sizes))
     for _ in range(settings.generations):
-        state = search.advance(state)  # runs that have solved the task stay as they are
+        state = advance(state)  # runs that have solved the task stay as they are
         if state.solved.all():
             break
     solved = np.asarray(state.solved)
@@ -138,15 +138,15 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-class Search(NamedTuple):
-    """Compiled functions over NES runs."""
+def make_search(
+    transform: str, mirrored: bool, population: int, devices: int | None
+) -> tuple[Callable[..., Any], Callable[[Any], Any]]:
+    """Builds Algorithm 1 for runs of a cell, which differ in their step sizes.
 
-    init: Callable[..., Any]  # (keys [run], step_sizes [run]) -> state
-    advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
-
-
-def make_search(transform: str, mirrored: bool, population: int, devices: int | None) -> Search:
-    """Builds Algorithm 1 for runs of a cell, which differ in their step sizes."""
+    Returns:
+      `init(keys [run], step_sizes [run]) -> state`, and `advance(state) -> state`, a generation of
+      every run that has not solved the task; compiled.
+    """
     own = [f"es.score_transform={transform}", f"es.mirrored={mirrored}"]
     own += [f"es.population_size={population}", "stop_when_solved=true"]
     config = dataclasses.replace(sejax.config([*SETTINGS, *own]), devices=devices)
@@ -160,7 +160,7 @@ def make_search(transform: str, mirrored: bool, population: int, devices: int | 
         return bilevel.generation(state)[0]
 
     advance = jax.jit(lambda state: jax.lax.map(generation, state, batch_size=RUNS_AT_ONCE))
-    return Search(init=jax.jit(init), advance=advance)
+    return jax.jit(init), advance
 
 
 def edges_of(bins: int) -> np.ndarray:

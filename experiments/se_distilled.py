@@ -13,13 +13,12 @@ import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import figures, tables
-from experiments.common.agents import CONTINUOUS, DISCRETE
+from experiments.common import agents, figures, tables
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
@@ -40,7 +39,7 @@ class SeDistilled(Settings):
 
     env: str = setting("halfcheetah")  # task
     # Kinds of students; all that the task's preset has.
-    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
+    students: tuple[str, ...] = setting((), each_of(agents.KINDS))
     num_seeds: int = count(3, quick=2)  # whole runs of the command
     num_tested: int = count(10, quick=2)  # students of each kind on the SE that is kept
     run: tuple[str, ...] = setting(())  # overrides of the command
@@ -48,8 +47,7 @@ class SeDistilled(Settings):
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of students."""
-        discrete = envs.make(self.env).num_actions is not None
-        return self.students or (DISCRETE if discrete else CONTINUOUS)
+        return self.students or agents.kinds_of_students(envs.make(self.env))
 
     def words(self, seed: int) -> list[str]:
         """The command's overrides for a seed."""
@@ -121,17 +119,18 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
     shown = []
     for seed, mine in summary.groupby("seed"):
         first = mine.iloc[0]
-        cells = {
+        costs = {
             "seed": str(seed),
             "generation": f"{first['generation']:.0f}",
             "real steps": f"{first['real_steps']:,.0f}",
             "CPU s": f"{first['cpu_s']:,.0f}",
             "the policy itself": f"{first['policy_return']:,.1f}",
         }
-        for row in mine.itertuples():
-            name = figures.AGENT_NAMES[str(row.kind)]
-            cells[name] = f"{row.mean:,.1f} ± {row.std:,.1f}, worst {row.worst:,.1f}"
-        shown.append(cells)
+        cells = {
+            figures.AGENT_NAMES[str(x.kind)]: f"{x.mean:,.1f} ± {x.std:,.1f}, worst {x.worst:,.1f}"
+            for x in mine.itertuples()
+        }
+        shown.append(costs | cells)
     own, config = read(settings.words(settings.seed))
     search = own.search
     note = (
@@ -159,10 +158,9 @@ def draw(settings: SeDistilled, rows: pd.DataFrame, path: Path) -> None:
             mine = chosen_by[chosen_by["agent"] == kind]
             ends = [mine["policy_return"].min(), mine["policy_return"].max()]
             axis.plot(ends, ends, color="0.7", lw=1, label="as good as the policy")
-            axis.plot(mine["policy_return"], mine["test_return"], "o", ms=3, alpha=0.6,
-                      color=figures.REAL, label="a student")  # fmt: skip
-            if np.isfinite(task.solved_reward):
-                axis.axhline(task.solved_reward, ls=":", lw=1, color=figures.SOLVED)
+            dots: dict[str, Any] = {"ms": 3, "alpha": 0.6, "color": figures.REAL}
+            axis.plot(mine["policy_return"], mine["test_return"], "o", label="a student", **dots)
+            figures.threshold(axis, task.solved_reward)
             axis.set_title(figures.AGENT_NAMES[kind], fontsize=10)
             axis.set_xlabel("return of the policy")
         axes[0, 0].set_ylabel("return of students")

@@ -37,6 +37,7 @@ PAPER = {
 @dataclass(frozen=True, kw_only=True)
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
+    quick_run = runs.QUICK
 
     generations: int | None = count(None, quick=8)  # outer iterations; the preset's
     runs: int = count(10, quick=3)  # independent NES runs
@@ -54,33 +55,13 @@ def compute(settings: SeFeasibility) -> pd.DataFrame:
 
 def learning_config(settings: SeFeasibility) -> Any:
     """The configuration of the NES runs."""
-    words = [f"agent_hparams={settings.agent_hparams}"]
-    config = settings.learn_config([*words, *(runs.QUICK if settings.quick else ())])
+    config = settings.learn_config([f"agent_hparams={settings.agent_hparams}"])
     require(
         config.name("proxy") != "rn",
         "run.proxy",
         "must be an SE; got rn. Set run.proxy=se, or run experiments.rn_performance.",
     )
     return config
-
-
-def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each run: what it took to solve the task and how far it came."""
-
-    def statistics(curve: pd.DataFrame) -> dict[str, float]:
-        to_solve = runs.generations_to_solve(curve, solved_reward)
-        at_solving = curve[curve["generation"] + 1 == to_solve]
-        return {
-            "generations": len(curve),
-            "generations_to_solve": to_solve,
-            "env_steps_to_solve": at_solving["env_steps_total"].max(),
-            "best_incumbent_mean": curve["incumbent_mean"].max(),
-            "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
-            "env_steps": curve["env_steps_total"].iloc[-1],
-            "wall_min": curve["wall_s"].iloc[-1] / 60,
-        }
-
-    return tables.summary_by(curves, ["seed"], statistics)
 
 
 def median_and_range(values: Any, limit: int) -> str:
@@ -94,17 +75,13 @@ def median_and_range(values: Any, limit: int) -> str:
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def median_steps(summary: pd.DataFrame) -> str:
-    """Of real steps to solve; a run that did not solve the task took more than all its steps."""
-    is_solved = np.isfinite(summary["generations_to_solve"])
-    middle = float(np.median(summary["env_steps_to_solve"].where(is_solved, np.inf)))
-    return f"{middle:,.0f}" if np.isfinite(middle) else f"> {summary['env_steps'].min():,.0f}"
-
-
 def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
     best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
-    to_solve = summary["generations_to_solve"]
+    to_solve, steps = summary["generations_to_solve"], summary["steps_to_solve"].median()
+    more = (
+        f"> {summary['steps'].min():,.0f}"  # one that did not solve it took more than all its steps
+    )
     row = pd.Series(tables.mean_columns(last, "last"))
     ours = {
         "runs": str(len(summary)),
@@ -112,7 +89,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "population": str(config.es.population_size),
         "runs with a first passage": f"{np.isfinite(to_solve).sum()} of {len(summary)}",
         "generations to the first passage": median_and_range(to_solve, config.generations),
-        "real steps to the first passage, median": median_steps(summary),
+        "real steps to the first passage, median": f"{steps:,.0f}" if np.isfinite(steps) else more,
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
         "last incumbent mean": tables.mean_text("last", 1)(row),
         "last incumbent mean, worst tenth": f"{worst_tenth(last):.1f}",
@@ -126,7 +103,8 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
 def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     config = learning_config(settings)
     solved_reward = config.task().solved_reward
-    summary = summarise(rows, solved_reward)
+    minutes = rows.groupby("seed", sort=False)["wall_s"].last() / 60
+    summary = runs.summarise(rows, ["seed"], solved_reward).assign(wall_min=minutes.to_numpy())
     draw(rows, solved_reward, settings.folder / "learning_curves.png")
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
     note = (

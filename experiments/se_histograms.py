@@ -143,16 +143,14 @@ def make_recorded_run(
         next_obs, reward = predict(steps.obs, steps.action)
         episode = jnp.arange(steps.reward.shape[0]) // task.max_steps
         met = trained.recorded.rows
-
-        def source(next_obs: Any, reward: Any, episode: Any, valid: Any) -> dict[str, Any]:
-            return {"next_obs": next_obs, "reward": reward, "episode": episode, "valid": valid}
-
         is_made = jnp.arange(capacity) < trained.train_steps
-        return {
-            "train": source(met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
-            "test": source(steps.next_obs, steps.reward, episode, steps.valid),
-            "response": source(next_obs, reward, episode, steps.valid),
+        sources = {
+            "train": (met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
+            "test": (steps.next_obs, steps.reward, episode, steps.valid),
+            "response": (next_obs, reward, episode, steps.valid),
         }
+        names = ("next_obs", "reward", "episode", "valid")
+        return {source: dict(zip(names, x, strict=True)) for source, x in sources.items()}
 
     return run
 

@@ -76,7 +76,7 @@ class SePerformance(Settings):
     test_episodes: int = count(10)  # of each agent
     max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
     varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
-    fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
+    fixed: str | None = setting(None, quick="cartpole")  # file of SEs learned with one agent's
     # Groups of agents on the real task, which is slow; as many as SEs.
     real_groups: int | None = count(None)
     # On the real task; 1000 (discrete TD3 in Acrobot 500).
@@ -94,8 +94,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
         conditions = {"real": on_real(settings, task, sets, kind)}
         conditions |= {name: on_ses(settings, ses, kind) for name, ses in sets.items()}
         for name, condition in conditions.items():
-            at_once = groups.groups_at_once(settings.devices)
-            rows = groups.train_groups(condition, settings, settings.num_agents, at_once=at_once)
+            rows = groups.train_groups(condition, settings, settings.num_agents)
             parts.append(rows.assign(kind=kind, setting=name))
     return pd.concat(parts, ignore_index=True)
 
@@ -108,8 +107,6 @@ def solved_ones(ses: ProxySet) -> Any:
 def load_sets(settings: SePerformance) -> dict[str, Any]:
     """The sets of SEs that are compared, by how they were learned; those with a file."""
     files = {name: x for name, x in settings.values("varied", "fixed").items() if x is not None}
-    if settings.quick and not files:
-        files["fixed"] = "cartpole"
     sets = {}
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
@@ -222,10 +219,8 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "agent": "{kind}",
         "trained on": lambda row: SHOWN[row.setting][1],
         "SEs, agents": "{num_ses}, {num_agents}",
-        "interval over": lambda row: (
-            tables.drawn_text(row.num_agents, "agents")
-            if row.setting == "real"
-            else tables.drawn_text(row.num_ses, "SEs")
+        "interval over": lambda row: tables.drawn_text(
+            *((row.num_agents, "agents") if row.setting == "real" else (row.num_ses, "SEs"))
         ),
         "training steps": tables.mean_text("train_steps", 0, std=True),
         "paper's": paper(PAPER_STEPS),

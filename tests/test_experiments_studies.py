@@ -61,7 +61,7 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
     solved_at, updates, solved, advanced, monkeypatch
 ):
     search = ScriptedSearch(solved_at)
-    monkeypatch.setattr(score_transforms, "make_search", lambda *_: search)
+    monkeypatch.setattr(score_transforms, "make_search", lambda *_: (search.init, search.advance))
     asked = score_transforms.ScoreTransforms.of(runs=len(updates), generations=5, seed=3)
     cell = score_transforms.compute_cell(asked, "nes", True)
     assert list(cell["updates"]) == updates and list(cell["solved"]) == solved
@@ -72,21 +72,21 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
 @pytest.mark.slow
 def test_the_search_is_the_bilevel_loop(monkeypatch):
     monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
-    search = score_transforms.make_search("single_best", True, 2, None)
+    init, advance = score_transforms.make_search("single_best", True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
-    state = start = search.init(keys, sizes)
+    state = start = init(keys, sizes)
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
     program = make_bilevel(**config.parts())
 
     @jax.jit
-    def init(keys):
+    def started(keys):
         state = jax.vmap(program.init)(keys)
         return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
 
-    expected, generation = init(keys), jax.jit(jax.vmap(program.generation))
+    expected, generation = started(keys), jax.jit(jax.vmap(program.generation))
     for _ in range(2):
-        state = search.advance(state)
+        state = advance(state)
         expected, _ = generation(expected)
     for new, old in zip(jax.tree.leaves(state), jax.tree.leaves(start), strict=True):
         assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"

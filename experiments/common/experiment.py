@@ -20,17 +20,7 @@ import pandas as pd
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.ops.files import write_bytes
-from sejax.options import (
-    ConfigError,
-    Options,
-    Rule,
-    as_text,
-    counts,
-    help_texts,
-    registry,
-    require,
-    shortened,
-)
+from sejax.options import ConfigError, Rule, as_text, registry, require, shortened
 from sejax.options.plain import from_plain, parsed, to_plain
 from sejax.runs import commands, runtime
 
@@ -53,11 +43,11 @@ def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> An
 
 def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
     """A field that counts something, `least` of them at least."""
-    return setting(default, counts("nothing is computed otherwise", least), quick=quick)
+    return setting(default, options.counts("nothing is computed otherwise", least), quick=quick)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(options.Options):
     """The fields that every experiment has. `of` makes them; a subclass adds its own.
 
     The folder of the results holds what is kept: table, figures, learned proxies and rows. The
@@ -152,9 +142,8 @@ class Settings(Options):
         """The command that makes these results: the fields that differ from their defaults."""
         mine = self.values(*(field.name for field in dataclasses.fields(self)))
         default = self.defaults(mine) | {"quick": False}
-        hidden = NOT_SHOWN
-        if self.folder.parts[:1] != ("results",) or self.folder == self._default_folder:
-            hidden = hidden | {"out"}
+        is_kept = self.folder.parts[:1] == ("results",) and self.folder != self._default_folder
+        hidden = NOT_SHOWN if is_kept else NOT_SHOWN | {"out"}
         words = ["python", "-m", f"experiments.{self.name}"]
         for name, value in mine.items():
             if name not in hidden and value != default[name]:
@@ -232,7 +221,7 @@ class Experiment:
         """The text of `--help`: all fields with their defaults."""
         settings: Any = self.settings
         full, quick = (settings.defaults({"quick": quick}) for quick in (False, True))
-        texts, lines = help_texts(settings), []
+        texts, lines = options.help_texts(settings), []
         for name, value in full.items():
             default, other = as_text(value), as_text(quick[name])
             differs = f" (quick: {other})" if default != other else ""

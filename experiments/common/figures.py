@@ -88,8 +88,9 @@ def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) 
 
 
 def threshold(axis: Any, solved_reward: float, label: str | None = None) -> None:
-    """Draws the return at which the task is solved, a dashed line."""
-    axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
+    """Draws the return at which the task is solved, a dashed line; none where it is not known."""
+    if np.isfinite(solved_reward):
+        axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
 
 
 def legend_above(figure: Any, axis: Any) -> None:

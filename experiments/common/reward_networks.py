@@ -51,7 +51,6 @@ QUICK: dict[str, Any] = {
     "rns": 2,
     "num_agents": 4,
     "max_steps": 1500,
-    "run": ("es.population_size=8",),
 }
 
 
@@ -167,6 +166,8 @@ def label(name: str) -> str:
 @dataclass(frozen=True, kw_only=True)
 class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
+
+    quick_run = ("es.population_size=8",)
 
     # Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
     env: str = setting("cliff_walking", one_of(STUDIES))

@@ -13,20 +13,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.common import agents, curves, figures
+from experiments.common import agents, curves, figures, tables
 from experiments.common.agents import Condition
 from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.statistics import worst_tenth
-from experiments.common.tables import (
-    WORST_NOTE,
-    as_texts,
-    drawn_text,
-    interval_note,
-    mean_columns,
-    mean_text,
-    summary_by,
-)
 from sejax import ProxySet
 from sejax.options import each_of, registry, require
 from sejax.training import TrainingConfig
@@ -161,14 +152,14 @@ def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
         return (
             {"groups": groups.nunique(), "agents": len(steps)}
             | {"solved": np.isfinite(to_solve).mean()}
-            | mean_columns(steps, "steps", labels)
-            | mean_columns(mean_return, "return", labels)
+            | tables.mean_columns(steps, "steps", labels)
+            | tables.mean_columns(mean_return, "return", labels)
             | {"return_worst_tenth": worst_tenth(mean_return)}
             | {"steps_restricted_to": max_steps}
             | {"last_return": each["last_return"].mean()}
         )
 
-    summary = summary_by(rows, ["row", "world"], statistics)
+    summary = tables.summary_by(rows, ["row", "world"], statistics)
     shares = [
         share_of_bare(*mine, *counted[row, "real"]) if (row, "real") in counted else np.nan
         for (row, _), mine in counted.items()
@@ -194,25 +185,20 @@ def step_grid(max_steps: int) -> np.ndarray:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
 
-    def share(row: Any) -> str:
-        return f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else ""
-
     most = summary["steps_restricted_to"].iloc[0]
-    return as_texts(
+    return tables.as_texts(
         summary,
         {
             "agents": lambda row: ROWS[row.row],
             "trained with": "{world}",
             "groups, agents": "{groups}, {agents}",
-            "interval over": lambda row: (
-                drawn_text(row.agents, "agents")
-                if row.world in WITHOUT_RN
-                else drawn_text(row.groups, "RNs")
+            "interval over": lambda row: tables.drawn_text(
+                *((row.agents, "agents") if row.world in WITHOUT_RN else (row.groups, "RNs"))
             ),
-            f"steps to solve, restricted to {most:,}": mean_text("steps", 0),
-            "of the bare agent's": share,
+            f"steps to solve, restricted to {most:,}": tables.mean_text("steps", 0),
+            "of the bare agent's": lambda row: tables.known_text(row.share_of_bare, ".0%"),
             "solved": "{solved:.0%}",
-            "mean return over training": mean_text("return", 1),
+            "mean return over training": tables.mean_text("return", 1),
             "worst tenth": "{return_worst_tenth:.1f}",
             "last tests": "{last_return:.1f}",
         },
@@ -228,8 +214,8 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
         "seeds. Curves that end early go on as the last test. "
-        f"{interval_note('what its column names')}"
-        f"{WORST_NOTE}{'' if settings.study.agent else learned_with}"
+        f"{tables.interval_note('what its column names')}"
+        f"{tables.WORST_NOTE}{'' if settings.study.agent else learned_with}"
     )
 
 
