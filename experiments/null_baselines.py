@@ -96,27 +96,22 @@ class NullBaselines(Settings):
         learning = getattr(shipped(self.env), "learning", None)
         return self.search_steps or (learning.real_steps if learning else 1_000_000)
 
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of students."""
-        return self.students or agents.kinds_of_students(self.task)
-
 
 def teachers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The policies that a source copies: the name of each, and what makes the teacher."""
     task = settings.task
-    for seed in range(settings.seed, settings.seed + settings.policies):
-        if source == "by_hand" and settings.env in bandits.BY_HAND:
-            yield f"hand-{seed:02d}", functools.partial(bandits.by_hand, task, seed)
-        if source == "search":
-            steps = settings.most_search_steps
-            yield f"ars-{seed:02d}", functools.partial(bandits.searched, task, steps, seed)
+    makes: dict[str, Callable[..., Any]] = {}  # teachers of a seed, by the beginning of their names
+    if source == "by_hand" and settings.env in bandits.BY_HAND:
+        makes["hand"] = functools.partial(bandits.by_hand, task)
+    if source == "search":
+        makes["ars"] = functools.partial(bandits.searched, task, settings.most_search_steps)
     if source in ("agent", "episodes"):
         for kind, steps in TEACHERS[settings.env].items():
             config, steps = agents.tuned_agent(settings.env, kind), settings.teacher_steps or steps
-            for seed in range(settings.seed, settings.seed + settings.policies):
-                make = functools.partial(bandits.trained, task, config, steps, seed)
-                yield f"{kind}-{seed:02d}", make
+            makes[kind] = functools.partial(bandits.trained, task, config, steps)
+    seeds = range(settings.seed, settings.seed + settings.policies)
+    for (name, make), seed in itertools.product(makes.items(), seeds):
+        yield f"{name}-{seed:02d}", functools.partial(make, seed)
 
 
 def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Any]) -> Any:
@@ -177,7 +172,7 @@ def train_students(
     budgets = [("default", steps) for steps in fewer if "default" in settings.hparams]
     budgets += [(hparams, most) for hparams in settings.hparams]
     found = []
-    for kind, (hparams, steps) in itertools.product(settings.kinds, budgets):
+    for kind, (hparams, steps) in itertools.product(agents.kinds_of_students(settings), budgets):
         condition = Condition(
             name=f"{source}-{kind}-{hparams}-{steps}",
             env=env,
@@ -212,15 +207,6 @@ def best_of_four(made: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found, columns=made.columns)
 
 
-def steps_until_solved(students: pd.DataFrame, solved_reward: float) -> pd.Series:
-    """The fewest steps of each student that solve the task; inf if none does.
-
-    The students of all numbers of steps have the same seeds.
-    """
-    solves = students["steps"].where(students["test_return"] >= solved_reward, np.inf)
-    return solves.groupby([students["group"], students["agent"]]).min()
-
-
 def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each source, teacher, kind of student and of hyperparameters."""
     made, students = unstack(rows, "makers"), unstack(rows, "students")
@@ -237,7 +223,8 @@ def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         last = mine[mine["steps"] == most]
         returns = last["test_return"]
-        steps = steps_until_solved(mine, solved_reward).median()
+        solves = mine["steps"].where(mine["test_return"] >= solved_reward, np.inf)
+        steps = solves.groupby([mine["group"], mine["agent"]]).min().median()  # of equal seeds
         return tables.mean_columns(returns, "test_return", last["group"]) | {
             "median": returns.median(),
             "worst_tenth": worst_tenth(returns),
@@ -270,7 +257,7 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     by = ["source", "teacher", "hparams"]
     for (source, teacher, hparams), mine in summary.groupby(by, sort=False):
         first = mine.iloc[0]
-        cells = {figures.AGENT_NAMES[str(row.kind)]: cell(row) for row in mine.itertuples()}
+        cells = {figures.agent_name(str(row.kind)): cell(row) for row in mine.itertuples()}
         costs = {
             "proxy made of": label(source, teacher),
             "real steps": f"{first['real_steps']:,.0f}",
@@ -284,11 +271,9 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Cells: mean return of fresh agents after {most:,} steps on the proxy (mean of the worst "
         f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
-        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). "
-        "Students' hyperparameters are their defaults, or drawn around them (varied). Real steps "
-        "are those of making one proxy, tests included; CPU seconds of bandits leave out tests and "
-        "compilation. Costs of the best of four are those of all four. A policy by hand took no "
-        "step of the real task; its tests did."
+        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). Real steps "
+        "of making one proxy have tests in them, CPU seconds of bandits neither tests nor "
+        "compilation. Costs of the best of four are those of all four."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)
@@ -299,7 +284,7 @@ def label(source: str, teacher: str) -> str:
     if source == "evolved":
         return f"{NAMES[source]} ({teacher})"
     is_taught = source in ("agent", "best_of_four", "episodes")
-    return NAMES[source] + (f": {figures.AGENT_NAMES[teacher]}" if is_taught else "")
+    return NAMES[source] + (f": {figures.agent_name(teacher)}" if is_taught else "")
 
 
 def cell(row: Any) -> str:

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from experiments.common import reward_networks, rn_curves, tables
@@ -80,25 +81,23 @@ def compute(settings: RnObjectives) -> pd.DataFrame:
 
 def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     solved_reward = settings.task.solved_reward
-    summaries: list[pd.DataFrame] = []
-    parts: list[pd.DataFrame] = []
-    for objective, pick in itertools.product(settings.objectives, settings.picks):
-        mine = beside(settings, rows, objective, pick)
-        summary = rn_curves.summarise(mine, settings.max_steps)
-        table = rn_curves.make_table(summary)
-        has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
-        if not parts:
-            parts.append(table[~has_rn].assign(objective="", RNs=""))
-        parts.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
-        summaries.append(summary.assign(objective=objective, pick=pick))
+    summary = pd.concat(
+        rn_curves.summarise(beside(settings, rows, objective, pick), settings.max_steps).assign(
+            objective=objective, pick=pick
+        )
+        for objective, pick in itertools.product(settings.objectives, settings.picks)
+    )
+    has_rn = ~summary["world"].isin(rn_curves.WITHOUT_RN)
+    table = rn_curves.make_table(summary)
+    table.insert(0, "RNs", [*summary["pick"].where(has_rn, "")])
+    table.insert(0, "objective", [*summary["objective"].map(OBJECTIVE_NAMES).where(has_rn, "")])
+    table = table.iloc[np.argsort(has_rn, kind="stable")].drop_duplicates(ignore_index=True)
     for pick in settings.picks:
         curves = {
             f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
             for name in settings.objectives
         }
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
-    table = pd.concat(parts, ignore_index=True)
-    table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
         f"{settings.rns} with the highest (best) or lowest (worst) scores train "
@@ -106,7 +105,7 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         "The area is by training steps, where the authors' code has the sum."
     )
     title = f"Objectives of reward networks on {settings.env}"
-    return tables.publish(settings, title, table, pd.concat(summaries), note)
+    return tables.publish(settings, title, table, summary, note)
 
 
 def beside(settings: RnObjectives, rows: pd.DataFrame, objective: str, pick: str) -> pd.DataFrame:

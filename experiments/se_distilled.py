@@ -10,7 +10,6 @@ included.
 
 import dataclasses
 import shlex
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ import sejax
 from experiments.common import agents, figures, tables
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
-from sejax import envs
 from sejax.distillation import distilling
 from sejax.distillation.config import read
 from sejax.options import each_of
@@ -44,15 +42,11 @@ class SeDistilled(Settings):
     num_tested: int = count(10, quick=2)  # students of each kind on the SE that is kept
     run: tuple[str, ...] = setting(())  # overrides of the command
 
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of students."""
-        return self.students or agents.kinds_of_students(envs.make(self.env))
-
     def words(self, seed: int) -> list[str]:
         """The command's overrides for a seed."""
+        kinds = ",".join(agents.kinds_of_students(self))
         return [
-            *(f"env={self.env}", f"agents=[{','.join(self.kinds)}]", f"seed={seed}"),
+            *(f"env={self.env}", f"agents=[{kinds}]", f"seed={seed}"),
             *(f"num_tested={self.num_tested}", *(QUICK if self.quick else ()), *self.run),
         ]
 
@@ -75,9 +69,7 @@ def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
 
     def run() -> pd.DataFrame:
         folder.mkdir(parents=True, exist_ok=True)
-        started = time.process_time()
         distilling.distill(own, config, folder, shlex.join(settings.words(seed)))
-        print(f"seed {seed}: {time.process_time() - started:.0f} CPU s", flush=True)
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
@@ -127,21 +119,19 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
             "the policy itself": f"{first['policy_return']:,.1f}",
         }
         cells = {
-            figures.AGENT_NAMES[str(x.kind)]: f"{x.mean:,.1f} ± {x.std:,.1f}, worst {x.worst:,.1f}"
+            figures.agent_name(str(x.kind)): f"{x.mean:,.1f} ± {x.std:,.1f}, worst {x.worst:,.1f}"
             for x in mine.itertuples()
         }
         shown.append(costs | cells)
     own, config = read(settings.words(settings.seed))
     search = own.search
     note = (
-        f"Each row is a run of `python -m sejax.distill`: augmented random search of a linear "
-        f"policy; {search.num_starts} searches begin with {search.start_generations} generations "
-        f"each, the best goes on to generation {search.generations}; students train on SEs of "
-        f"{own.num_snapshots} policies, and one SE is kept. Real steps and CPU seconds are those "
-        "of the whole run: all searches, students and tests. A kind's column: mean, standard "
-        f"deviation and worst of {settings.num_tested} students that took no part in choosing, "
-        f"each after {config.training.max_steps:,} steps on the SE, by the mean of "
-        f"{config.training.test_episodes} episodes on the real task."
+        f"Each row is a run of `python -m sejax.distill`: {search.num_starts} searches begin with "
+        f"{search.start_generations} generations each, the best goes on to generation "
+        f"{search.generations}; students train on SEs of {own.num_snapshots} policies, and one SE "
+        "is kept. Costs are those of the whole run. A kind's column: mean, standard deviation and "
+        f"worst of {settings.num_tested} students that took no part in choosing, each after "
+        f"{config.training.max_steps:,} steps on the SE."
     )
     title = f"SEs of {settings.env} made of a searched policy"
     return tables.publish(settings, title, pd.DataFrame(shown), summary, note)
@@ -161,7 +151,7 @@ def draw(settings: SeDistilled, rows: pd.DataFrame, path: Path) -> None:
             dots: dict[str, Any] = {"ms": 3, "alpha": 0.6, "color": figures.REAL}
             axis.plot(mine["policy_return"], mine["test_return"], "o", label="a student", **dots)
             figures.threshold(axis, task.solved_reward)
-            axis.set_title(figures.AGENT_NAMES[kind], fontsize=10)
+            axis.set_title(figures.agent_name(kind), fontsize=10)
             axis.set_xlabel("return of the policy")
         axes[0, 0].set_ylabel("return of students")
         axes[0, 0].legend(fontsize=8)

@@ -41,16 +41,6 @@ KINDS: dict[str, tuple[str, ...]] = {
     "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
     "ten_steps": (*WHOLE, "proxy.horizon=10", "proxy.done=threshold"),
 }
-# On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
-# each, where no action is dear.
-NOT_BANDIT = {
-    ("pendulum", "td3"): (
-        "agent.warmup_episodes=1",
-        "agent.action_noise_std=0.1",
-        "agent.policy_delay=2",
-    ),
-    ("pendulum", "sac"): ("agent.warmup_episodes=1",),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,30 +56,14 @@ class SeDynamics(RunSettings):
     num_agents: int = count(10, quick=5)  # of each kind and discount on each SE
     test_episodes: int = count(10)  # of each agent
 
-    @property
-    def tested(self) -> tuple[str, ...]:
-        """The kinds of students."""
-        return self.students or agents.kinds_of_students(envs.make(self.env))
-
-    @property
-    def learner(self) -> str:
-        """The kind of agent that SEs are learned with."""
-        return agents.kinds_of_students(envs.make(self.env))[0]
-
-    def agent_words(self, kind: str, agent: str) -> tuple[str, ...]:
-        """Overrides of a kind of agent on a kind of SE."""
-        return () if kind == "bandit" else NOT_BANDIT.get((self.env, agent), ())
-
-    def agent_of(self, kind: str, agent: str) -> Any:
-        """The configuration of a student on a kind of SE."""
-        words = self.agent_words(kind, agent)
-        return sejax.config([f"env={self.env}", f"agent={agent}", *words]).agent
+    def agent_of(self, student: str) -> Any:
+        """The configuration of a kind of students."""
+        return sejax.config([f"env={self.env}", f"agent={student}"]).agent
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
         tenth = envs.make(self.env).max_steps // 10
         words = [word.format(tenth=tenth) for word in KINDS[kind]]
-        words += self.agent_words(kind, self.learner)
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
@@ -99,11 +73,11 @@ class SeDynamics(RunSettings):
 def compute(settings: SeDynamics) -> pd.DataFrame:
     """Learns and trains what is missing; rows of NES runs and of agents."""
     task = envs.make(settings.env)
-    tuned = agents.tuned_agent(settings.env, settings.learner)
+    tuned = agents.tuned_agent(settings.env, agents.usual_kind(task))
+    students = {x: settings.agent_of(x) for x in agents.kinds_of_students(settings)}
     curves, tests = [], [se_myopia.untrained(settings, task, tuned)]
     for kind in settings.kinds:
         config = settings.config_of(kind)
-        students = {x: settings.agent_of(kind, x) for x in settings.tested}
         chunks = session.make_chunks(config)
         folder = settings.work_folder / "runs" / kind
         for run in runs.configs_of(config, settings.runs, folder):
@@ -205,7 +179,7 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
         "SEs that solve": "{solved} of {runs}",
     }
     for student in agents["student"].dropna().unique():
-        columns[figures.AGENT_NAMES[student]] = tables.mean_text(f"on_{student}", 1)
+        columns[figures.agent_name(student)] = tables.mean_text(f"on_{student}", 1)
     for discount in se_myopia.DISCOUNTS:
         columns[f"discount {discount:g}"] = tables.mean_text(se_myopia.column(discount), 1)
     columns["verdicts"] = lambda row: ", ".join(
@@ -213,21 +187,18 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     )
     summary = summary.rename(columns=lambda name: name.replace(" ", "_"))
     note = (
-        f"NES runs of {settings.generations} generations for each kind; real steps and CPU s (of "
-        "the generations, without compilation) until the first incumbent mean of at least "
-        f"{task.solved_reward:g}: medians over runs, - if half of them had none. The best SE of "
-        f"each run trains {settings.num_agents} fresh agents of each kind with its default "
-        "hyperparameters, and of the learning kind with each discount: mean return on "
-        f"{task.name}. {tables.interval_note('SEs')} SEs that solve: those whose fresh agents "
-        "of the learning kind reach that on average. Steps of an episode: of these agents' "
-        "training. Verdicts of the SEs as in se_myopia."
+        f"NES runs of {settings.generations} generations; costs (without compilation) until the "
+        f"first incumbent mean of at least {task.solved_reward:g}: medians over runs, - if half of "
+        f"them had none. The best SE of each run trains {settings.num_agents} fresh agents of each "
+        "kind, and of the learning kind with each discount, which also say which SEs solve the "
+        f"task: mean return. {tables.interval_note('SEs')} Verdicts as in se_myopia."
     )
     title = f"SEs of {task.name} that may teach through their dynamics, beside a bandit"
     return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
 
 
 def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
-    """Draws each run's incumbent means as a thin line and their mean as a thick one, by kind."""
+    """Draws the NES runs of each kind."""
     kinds = list(curves.groupby("kind", sort=False))
     wide = min(len(kinds), 4)
     high = -(-len(kinds) // wide)
@@ -235,16 +206,10 @@ def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
         for axis in axes.flat[len(kinds) :]:
             axis.remove()
         for axis, (kind, mine) in zip(axes.flat, kinds, strict=False):
-            lines = mine.pivot(index="generation", columns="seed", values="incumbent_mean")
-            places = lines.index + 1
-            axis.plot(places, lines, color=figures.REAL, lw=0.7, alpha=0.6)
-            axis.plot(places, lines.mean(axis=1), color=figures.REAL, lw=2.2)
-            figures.threshold(axis, task.solved_reward)
+            figures.runs(axis, mine, task.solved_reward)
             axis.set_title(kind.replace("_", " "), fontsize=10)
         for axis in axes[:, 0]:
             axis.set_ylabel("incumbent's mean return")
-        for axis in axes.flat[max(0, len(kinds) - wide) : len(kinds)]:
-            axis.set_xlabel("generation")
 
 
 EXPERIMENT = Experiment(settings=SeDynamics, compute=compute, report=report, about=__doc__)

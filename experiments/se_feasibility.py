@@ -66,12 +66,8 @@ def learning_config(settings: SeFeasibility) -> Any:
 
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
-    values = np.asarray(values, float)
-
-    def text(x: float) -> str:
-        return f"{x:g}" if np.isfinite(x) else f"> {limit}"
-
-    middle, low, high = map(text, (np.median(values), values.min(), values.max()))
+    values = np.median(values), np.min(values), np.max(values)
+    middle, low, high = (f"{x:g}" if np.isfinite(x) else f"> {limit}" for x in values)
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
@@ -110,40 +106,23 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Preset {config.preset}. An incumbent mean is over "
         f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
-        f"{config.training.test_episodes} test episodes each; the "
-        f"first passage is the first that reaches {solved_reward:g}, which does not say that fresh "
-        "agents solve the task on that SE. Median and range over runs; one "
-        "without a first passage took longer than all. The last incumbent mean: over runs. "
-        f"{tables.interval_note('runs')} The best is a maximum of noisy means and hence too high: "
-        f"se_performance tests the stored SEs with other agents.{tables.WORST_NOTE}"
+        f"{config.training.test_episodes} test episodes each; the first passage is the first that "
+        f"reaches {solved_reward:g}. Median and range over runs. {tables.interval_note('runs')} "
+        "The best is a maximum of noisy means and hence too high: se_performance tests the stored "
+        f"SEs with other agents.{tables.WORST_NOTE}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
     return tables.publish(settings, title, make_table(config, summary), summary, note)
 
 
 def draw(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
-    """Draws each run's incumbent mean as a thin line, and their mean with one std.
+    """Draws the NES runs.
 
     Source: paper, figure "Multiple NES runs of Alg. 1".
     """
-    lines = curves.pivot(index="generation", columns="seed", values="incumbent_mean")
-    lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
-    iterations = lines.index.to_numpy() + 1
-    mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
-    with figures.panels(path, 1, 1, (6, 3.6)) as (_, axes):
-        axis = axes[0, 0]
-        for index, seed in enumerate(lines.columns):
-            label = None if index else f"NES run ({lines.shape[1]} in all)"
-            axis.plot(iterations, lines[seed], color=figures.REAL, lw=0.7, alpha=0.5, label=label)
-        shade: Any = {"color": figures.REAL, "alpha": 0.15, "lw": 0}
-        axis.fill_between(
-            iterations, mean - std, mean + std, label="mean ± std of the runs", **shade
-        )
-        axis.plot(iterations, mean, color=figures.REAL, lw=2.4)
-        figures.threshold(axis, solved_reward, f"solved ({solved_reward:g})")
-        label = "mean return of the incumbent's\nagents on the real task"
-        limits = (1, max(iterations[-1], 2))
-        axis.set(xlabel="NES outer iteration", xlim=limits, ylabel=label)
+    with figures.panels(path, 1, 1, (6, 3.6)) as (_, [[axis]]):
+        figures.runs(axis, curves, solved_reward)
+        axis.set_ylabel("mean return of the incumbent's\nagents on the real task")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(fontsize=9, loc="best")
 

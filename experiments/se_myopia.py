@@ -17,6 +17,7 @@ More and less are those of Student's 95% interval over the agents of an SE, in p
 """
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,14 +81,10 @@ def find(settings: SeMyopia) -> Iterator[Se]:
 
 def set_name(file: str) -> str:
     """A file's name for people: of those that are one set, the folder that they are in."""
-    path = Path(file)
-    if path.suffix != ".safetensors":
-        return f"{file} (shipped)" if file in header.pretrained_names() else file
-    if path.name == "proxy.safetensors":  # of a run, one of several
-        path = path.parents[1]
-    elif path.name == "ses.safetensors":
-        path = path.parent
-    return str(path.with_suffix("")).removeprefix("results/")
+    if file in header.pretrained_names():
+        return f"{file} (shipped)"
+    ends = r"^results/|/ses\.safetensors$|/[^/]+/proxy\.safetensors$|\.safetensors$"
+    return re.sub(ends, "", file)
 
 
 def make_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Any:
@@ -107,7 +104,7 @@ MEASURE = dataclasses.replace(agents.OUTCOMES, make_run=make_run)
 
 def agent_on(settings: SeMyopia, ses: ProxySet) -> Any:
     """DDQN, or TD3, as the set was learned with it; else as it is tuned for the task."""
-    kind = "td3" if ses.task.num_actions is None else "ddqn"
+    kind = agents.usual_kind(ses.task)
     for values in header.agents_of(ses.config).values():
         if values["name"] == kind:
             return registry.configure("agent", values)
@@ -249,8 +246,7 @@ def summarise(ses: pd.DataFrame, agents: pd.DataFrame, solved_reward: float) -> 
 
 def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
-    ses, agents = unstack(rows, "ses"), unstack(rows, "agents")
-    summary = summarise(ses, agents, task.solved_reward)
+    summary = summarise(unstack(rows, "ses"), unstack(rows, "agents"), task.solved_reward)
     draw(settings, summary)
     shown: dict[str, Any] = {
         "SEs": "{set}",
@@ -264,7 +260,7 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
         shown[f"discount {discount:g}"] = cell(column(discount))
     shown["verdict"] = "{verdict}"
     table = tables.as_texts(summary, shown)
-    kind = figures.AGENT_NAMES["td3" if task.num_actions is None else "ddqn"]
+    kind = figures.agent_name(agents.usual_kind(task))
     least, most = DISCOUNTS[0], DISCOUNTS[-1]
     untrained = summary["untrained"].iloc[0]
     none = MARGIN * (task.solved_reward - untrained)
@@ -272,13 +268,11 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.num_agents} {kind} on each SE with each discount. Cells: mean return on "
         f"{task.name} (mean of the worst tenth). "
         f"{tables.interval_note('SEs, agents where there is one SE')} Steps of an episode: mean "
-        f"over the training of agents with discount {most:g}. Verdict on each SE, by Student's 95% "
-        f"interval of the difference of returns with discounts {most:g} and {least:g} over pairs "
-        f"of agents of equal seeds. Dynamics: above {none:.3g}, {MARGIN:.0%} of the way "
-        f"from untrained agents ({untrained:.1f}) to the solved return ({task.solved_reward:g}). "
-        f"Policy: below it. Teaches little: agents with discount {most:g} are less than that above "
-        "untrained ones. Open: the intervals hold both. Where episodes are one step, a discount "
-        "is of no effect."
+        f"over the training of agents with discount {most:g}. Verdict on each SE, by differences "
+        f"of {none:.3g}, {MARGIN:.0%} of the way from untrained agents ({untrained:.1f}) to the "
+        f"solved return ({task.solved_reward:g}). Dynamics: discounts {most:g} and {least:g} "
+        "differ by more. Policy: by less. Teaches little: the far-sighted are less than that above "
+        "untrained ones. Open: the intervals hold both."
     )
     title = f"Which SEs of {task.name} teach agents that look ahead less"
     return tables.publish(settings, title, table, summary, note)

@@ -116,12 +116,10 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs of Cliff Walking and CartPole our default has the paper's "
-        "agents and sizes. "
+        "agents and sizes."
     )
-    if settings.quick:
-        note += "quick=true: few agents, short trainings, not to be compared with the paper's. "
     title = "Seconds for one outer iteration of NES"
-    return publish(settings, title, as_texts(timed, columns), timed, note.strip())
+    return publish(settings, title, as_texts(timed, columns), timed, note)
 
 
 def _digits(seconds: float) -> str:

@@ -114,7 +114,7 @@ def test_intervals_are_over_ses_and_not_agents_but_on_the_real_task():
         assert row["solved"] == 0.4  # two SEs of five
     few = se_performance.summarise(made_up_agents(num_ses=4), 25.0)
     assert np.isnan(few["test_return_low"][0]) and np.isnan(few["train_steps_high"][0])
-    assert "[" not in se_performance.make_table("cartpole", few)["return"][0]
+    assert "[" not in se_performance.make_table("cartpole", few, 1000)["return"][0]
 
 
 def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():

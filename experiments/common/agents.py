@@ -17,14 +17,13 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings
-from sejax import Proxy, ProxySet, Task
+from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents import NoExploration
 from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
 from sejax.options.plain import to_plain
 from sejax.runs.progress import Tally
-from sejax.training import TrainingConfig
 
 # Kinds of students, where actions are discrete and where they are continuous.
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -69,8 +68,8 @@ class Condition:
 
     @classmethod
     def of_set(cls, proxies: ProxySet, names: Iterable[str], **rest: Any) -> Self:
-        """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        groups = tuple(Group.of(x, proxies[i % len(proxies)]) for i, x in enumerate(names))
+        """The proxies of a `ProxySet`, one for each group."""
+        groups = tuple(Group.of(name, proxies[i]) for i, name in enumerate(names))
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
@@ -94,7 +93,6 @@ class Measure:
     make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
     # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
-    log: Callable[[pd.DataFrame], str]  # a line about the rows of a group
     is_timed: bool = False  # whether rows have a column `cpu_s`, the cost of an agent
 
 
@@ -114,22 +112,11 @@ def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     )
 
 
-def outcome_log(rows: pd.DataFrame) -> str:
-    """A line about `outcome_rows`."""
-    mean = rows[["test_return", "train_steps"]].mean()
-    return f"mean return {mean['test_return']:.1f} after {mean['train_steps']:,.0f} steps"
-
-
-OUTCOMES = Measure(
-    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows, log=outcome_log
-)
+OUTCOMES = Measure(make_run=sejax.make_evaluator, to_table=outcome_rows)
 
 
 def train_groups(
-    condition: Condition,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure = OUTCOMES,
+    condition: Condition, settings: Settings, num_agents: int, measure: Measure = OUTCOMES
 ) -> pd.DataFrame:
     """Rows of all agents of a condition, with a column `group`; trains the missing groups.
 
@@ -161,7 +148,7 @@ def train_groups(
 
             made = settings.shards.compute_all(made_with, compute)
             for name, table in zip(chosen, made, strict=True):
-                print(f"{name}: {measure.log(table)}", flush=True)
+                print(f"{name}: done", flush=True)
                 tables.append(table.assign(group=groups[name].name))
                 tally.add(num_agents)
     return worst_for_diverged(pd.concat(tables, ignore_index=True), condition.name)
@@ -252,8 +239,7 @@ def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
     returns = ["test_return", *return_columns(rows)]
     worst = float(rows[returns].min(axis=None))
     count = len(rows[lost].groupby(["group", "agent"]))
-    said = f"{count} agents diverged; their tests count as the worst return there, {worst:.1f}."
-    print(f"{name}: {said}", flush=True)
+    print(f"{name}: {count} agents diverged; their tests count as {worst:.1f}, the worst return.")
     return rows.fillna(dict.fromkeys(returns, worst))
 
 
@@ -283,23 +269,26 @@ def shipped(name: str) -> Any:
     return next((card for card in sejax.pretrained() if card.name == name), None)
 
 
-def kinds_of_students(task: Task) -> tuple[str, ...]:
-    """The kinds of agents that fit a task's actions; the first is the one that SEs are for."""
-    return CONTINUOUS if task.num_actions is None else DISCRETE
+def usual_kind(task: Task) -> str:
+    """The kind of agents that SEs of a task are learned with, and tested by."""
+    return CONTINUOUS[0] if task.num_actions is None else DISCRETE[0]
+
+
+def kinds_of_students(settings: Any) -> tuple[str, ...]:
+    """The kinds in `settings.students`, or all that fit the actions of the task `settings.env`."""
+    is_discrete = envs.make(settings.env).num_actions is not None
+    return settings.students or (DISCRETE if is_discrete else CONTINUOUS)
 
 
 # --- agents on SEs -------------------------------------------------------------------------------
 
 SE_AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
-# With quick=true. Hidden sizes up to 6: one network has room for all of them.
-QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
-QUICK_STEPS = 1500
 SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
 
 
-def agent_config(settings: Settings, kind: str) -> Any:
-    """The configuration of a kind of agent."""
-    return registry.configure("agent", {"name": kind, **(QUICK_AGENT if settings.quick else {})})
+def agent_config(kind: str) -> Any:
+    """The default configuration of a kind of agent."""
+    return registry.configure("agent", {"name": kind})
 
 
 def training_as_learned(

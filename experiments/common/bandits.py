@@ -246,7 +246,8 @@ def copy(task: Task, teacher: Teacher, num_states: int, widen: float) -> Copied:
     noise = jax.random.normal(key_noise, rows.shape)
     is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
     if np.isinf(widen):
-        states = in_task_units(task, noise)
+        units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
+        states = noise if units is None else units.decode(noise)
     else:
         states = jnp.where(
             is_wide & (widen > 0), visited.mean(0) + widen * (noise * visited.std(0)), rows
@@ -269,9 +270,3 @@ def _programs(task: Task, agent: sejax.Agent) -> tuple[Callable[..., Any], Calla
     tested = jax.jit(lambda key, state: (test(key, state), record(key, state)))
     acts = jax.vmap(lambda state, obs: act(jax.random.key(0), state, obs), (None, 0))
     return tested, jax.jit(acts)
-
-
-def in_task_units(task: Task, noise: Array) -> Array:
-    """Noise `[state, obs_dim]` as the states in which episodes of the task's SEs begin."""
-    units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
-    return noise if units is None else units.decode(noise)

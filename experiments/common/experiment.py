@@ -26,22 +26,21 @@ from sejax.runs import commands, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
-_SAME = object()
 
 
-def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> Any:
+def setting(default: Any, rule: Rule | None = None, *, quick: Any = None) -> Any:
     """A field of `Settings`. The comment beside it is its help text.
 
     Args:
       default: its default; None where it may be left open.
       rule: what must hold, as in `sejax.options`.
-      quick: its default with `quick=true`.
+      quick: its default with `quick=true`, if it is another one.
     """
-    metadata = {"rule": rule, "quick": default if quick is _SAME else quick}
+    metadata = {"rule": rule, "quick": default if quick is None else quick}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
+def count(default: int | None, least: int = 1, *, quick: Any = None) -> Any:
     """A field that counts something, `least` of them at least."""
     return setting(default, options.counts("nothing is computed otherwise", least), quick=quick)
 

@@ -14,7 +14,7 @@ from experiments.common.agents import OUTCOMES, Condition, Group
 from experiments.common.experiment import Settings, count, setting
 from experiments.common.shards import stack
 from sejax import Proxy, Task, TrainingConfig, options
-from sejax.options import each_of, registry, require
+from sejax.options import each_of, registry
 from sejax.proxies.header import pretrained_names
 
 NUM_GROUPS = 5  # of agents: the CPU seconds of a group are one value
@@ -49,18 +49,7 @@ class BreakEven(Settings):
     num_pilots: int | None = count(None, quick=2)
     max_steps: int | None = count(None, quick=3000)  # of an agent with real steps; by the task
     test_episodes: int = count(10)  # of each agent
-    nulls: str = setting("results/null_baselines")  # folder of their rows, by task
-    pilot_seed: int = setting(500, options.seed())  # first seed of the pilots
-    seed: int = setting(1000, options.seed())  # first seed of all others
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.pilot_seed != self.seed,
-            "pilot_seed",
-            f"must be another one than seed={self.seed}, as the pilots choose a kind of agents; "
-            f"got {self.pilot_seed}. Set pilot_seed={self.seed + 1}.",
-        )
+    seed: int = setting(1000, options.seed())  # first seed; pilots have the one 500 before
 
     def counts(self, task: Task) -> tuple[int, int]:
         """How many agents of each sort, and how many pilots."""
@@ -131,9 +120,8 @@ class Study:
 
     def pilots(self) -> Generator[pd.DataFrame, None, str]:
         """Agents of each kind, one group of other seeds; returns the kind that is fastest."""
-        settings = dataclasses.replace(
-            self.settings, seed=self.settings.pilot_seed, pilot_seed=self.settings.seed
-        )
+        seed = (self.settings.seed - 500) % 2**31
+        settings = dataclasses.replace(self.settings, seed=seed)
         steps = {}
         for kind in kinds_for(self.task):
             agent = agents.tuned_agent(self.task.name, kind)

@@ -18,9 +18,8 @@ from experiments.common.agents import Condition
 from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.statistics import worst_tenth
-from sejax import ProxySet
+from sejax import ProxySet, TrainingConfig
 from sejax.options import each_of, registry, require
-from sejax.training import TrainingConfig
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
     "default": "default hyperparameters",
@@ -44,10 +43,10 @@ class CurveSettings(RnSettings):
     # Exploration bonuses on the real task to compare with: count_based on cliff_walking, elsewhere
     # icm; or none.
     bonuses: tuple[str, ...] = setting(())
-    rns: int = count(10)  # RNs of each variant that agents are trained on, the best
+    rns: int = count(10, quick=2)  # RNs of each variant that agents are trained on, the best
     bonus_groups: int = count(10)  # groups of agents with a bonus; as many as RNs
-    num_agents: int = count(10)  # on each RN, in each row
-    max_steps: int = count(5000)  # of training; as the paper's figure
+    num_agents: int = count(10, quick=4)  # on each RN, in each row
+    max_steps: int = count(5000, quick=1500)  # of training; as the paper's figure
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -70,7 +69,7 @@ class CurveSettings(RnSettings):
         if row == "transfer":
             return self.study.transfer_agent
         if row == "tuned" and self.study.tuned_agent:
-            return self.study.tuned_agent()
+            return self.study.tuned_agent
         return self.study.agent or self.learning_agent
 
     def training(self, row: str) -> TrainingConfig:
@@ -145,7 +144,7 @@ def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
         each = mine.groupby("agent").first()
         groups, to_solve = each["group"], each["steps_to_solve"]
         steps = to_solve.clip(upper=max_steps)
-        held = curves.on_grid(mine, grid, window=1)
+        held = curves.on_grid(mine, grid)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         labels = None if world in WITHOUT_RN else groups
         counted[row, world] = steps, groups
@@ -233,7 +232,7 @@ def draw(settings: Any, rows: dict[str, pd.DataFrame], height: float, name: str)
                 panel(axis, mine[mine["row"] == row], settings.max_steps, solved_reward)
             line[0].set_ylabel(label)
         for axis, row in zip(axes[0], settings.rows, strict=True):
-            agent = figures.AGENT_NAMES[registry.name_of("agent", settings.agent(row))]
+            agent = figures.agent_name(registry.name_of("agent", settings.agent(row)))
             axis.set_title(f"{agent}, {ROWS[row]}", fontsize=10)
         for axis in axes[-1]:
             axis.set_xlabel("training steps")
@@ -251,7 +250,7 @@ def panel(axis: Any, rows: pd.DataFrame, max_steps: int, solved_reward: float) -
         name = str(world)
         style = "--" if name in WITHOUT_RN[1:] else ":" if AUGMENTED in name else "-"
         color, _ = SHOWN[name.removesuffix(AUGMENTED)]
-        held, line = curves.on_grid(mine, grid, window=1), {"ls": style, "lw": 1.6}
+        held, line = curves.on_grid(mine, grid), {"ls": style, "lw": 1.6}
         figures.band(axis, grid, held, standard_errors, color, label=label(name), **line)
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
 

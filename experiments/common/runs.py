@@ -67,9 +67,7 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
 
 
 def learn(
-    configs: list[Any],
-    option: str = "work",
-    chunks: session.Chunks | None = None,
+    configs: list[Any], option: str = "work", chunks: session.Chunks | None = None
 ) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
@@ -89,7 +87,9 @@ def learn(
     with Tally(len(configs), "NES runs") as tally:
         for config in configs:
             with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
-                curve = _learn_one(config, directory, chunks)
+                path = directory.path / "cpu_s.txt"
+                session.run(config, directory, timed(chunks, path))
+                curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
             there = int(curve["generation"].max()) + 1 if len(curve) else 0
             require(
                 there <= config.generations,
@@ -99,16 +99,9 @@ def learn(
             )
             best = curve["best_so_far"].max()
             print(f"{config.run_dir}: {there} generations, best {best:.1f}", flush=True)
-            curves.append(curve)
+            curves.append(curve.assign(cpu_s=pd.Series(read_costs(path, len(curve)))))
             tally.add()
     return pd.concat(curves, ignore_index=True)
-
-
-def _learn_one(config: Any, directory: Any, chunks: session.Chunks) -> pd.DataFrame:
-    path = directory.path / "cpu_s.txt"
-    session.run(config, directory, timed(chunks, path))
-    curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)  # those of the verified checkpoint
-    return curve.assign(cpu_s=pd.Series(read_costs(path, len(curve))))
 
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
@@ -147,7 +140,7 @@ def summarise(curves: pd.DataFrame, by: Sequence[str], solved_reward: float) -> 
             "generations": len(curve),
             "generations_to_solve": to_solve,
             "steps_to_solve": spent["env_steps_total"].max() if is_solved else np.inf,
-            "cpu_s_to_solve": spent["cpu_s"].sum() if is_solved else np.inf,
+            "cpu_s_to_solve": spent["cpu_s"].sum(min_count=1) if is_solved else np.inf,
             "best_incumbent_mean": curve["incumbent_mean"].max(),
             "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
             "steps": curve["env_steps_total"].max(),
