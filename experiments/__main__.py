@@ -1,8 +1,7 @@
 """`python -m experiments`: the list of all experiments."""
 
-import ast
+import importlib
 import pkgutil
-from pathlib import Path
 
 import experiments
 
@@ -12,8 +11,7 @@ def main() -> None:
     print("python -m experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
     for module in pkgutil.iter_modules(experiments.__path__):
         if not module.ispkg and module.name != "__main__":
-            source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
-            about = ast.get_docstring(ast.parse(source)) or ""
+            about = importlib.import_module(f"experiments.{module.name}").__doc__ or ""
             print(f"  {module.name:22} {about.partition(chr(10))[0]}")
 
 

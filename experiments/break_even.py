@@ -16,6 +16,7 @@ return less, their mean. Beside it stands what a bandit costs that copies a poli
 (`experiments.null_baselines`, read when the table is made).
 """
 
+import functools
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +28,7 @@ import pandas as pd
 from experiments import null_baselines
 from experiments.common import curves, figures, tables
 from experiments.common.experiment import Experiment
-from experiments.common.proxy_users import GRID_POINTS, BreakEven, compute, step_grid
+from experiments.common.proxy_users import BreakEven, compute, step_grid
 from experiments.common.shards import read_rows, unstack
 from experiments.common.statistics import difference_interval, worst_tenth
 
@@ -40,14 +41,10 @@ PAIRS = {
 ROLES = ("student", "same", "tuned_student", "tuned")
 SHOWN = ("agent", "steps_mean", "reached", "return_mean", "return_worst_tenth")
 COSTS = ("of", "task", "learning_steps", "learning_cpu_s")
+NULLS_FOLDER = Path("results/null_baselines")  # of their rows, by task
 NULLS = ("by_hand", "best_of_four")
 NULL_MEASURES = ("real_steps", "test_return_mean", "cpu_s")
 NULL_COLUMNS = ("source", "kind", "hparams", *NULL_MEASURES)
-RUNS = {  # of NES, whose curves are drawn
-    "cartpole": "results/se_feasibility/cartpole-one-step",
-    "acrobot": "results/se_feasibility/acrobot-one-step",
-    "halfcheetah": "results/se_feasibility/halfcheetah",
-}
 NEVER = float("inf")
 
 
@@ -123,11 +120,11 @@ def columns_of(agents: pd.DataFrame, real: pd.Series, role: str) -> dict[str, An
     return {f"{role}_{name}": value for name, value in each.items()}
 
 
-def with_nulls(summary: pd.DataFrame, folder: str) -> pd.DataFrame:
+def with_nulls(summary: pd.DataFrame, folder: Path) -> pd.DataFrame:
     """The summary with columns of the bandits of `cheapest`; nan where none is known."""
     found = []
     for row in summary.itertuples():
-        stored = stored_nulls(Path(folder, str(row.task), "rows.csv.xz"))
+        stored = stored_nulls(folder / str(row.task) / "rows.csv.xz")
         mine = stored[(stored["kind"] == row.student_agent) & (stored["hparams"] == "default")]
         own: dict[str, Any] = {}
         for source in NULLS:
@@ -151,10 +148,8 @@ def cheapest(bandits: pd.DataFrame, target: Any) -> Any:
 
     If they reach it on none, that on which they return most; nan where there is none.
     """
-    good = bandits[bandits["test_return_mean"] >= target]
-    if len(good):
-        return good.sort_values("real_steps").iloc[0]
-    order = bandits.sort_values("test_return_mean", ascending=False)
+    good = bandits[bandits["test_return_mean"] >= target].sort_values("real_steps")
+    order = good if len(good) else bandits.sort_values("test_return_mean", ascending=False)
     return order.iloc[0] if len(order) else dict.fromkeys(NULL_MEASURES, np.nan)
 
 
@@ -174,29 +169,22 @@ def agents_text(value: float, low: float, high: float) -> str:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-    texts = {
-        "real steps to learn it": (count_text, "learning_steps"),
-        "students": (users_text, "student"),
-        "the same on the task": (users_text, "same"),
-        "tuned on the task": (users_text, "tuned"),
-        "tuned students": (users_text, "tuned_student"),
-        "agents until it pays": (paid_text, "break_even"),
-        "beside the same": (paid_text, "break_even_same"),
-        "by CPU seconds": (paid_text, "break_even_cpu"),
-        "a bandit by hand": (null_text, "by_hand"),
-        "a bandit of the best of four": (null_text, "best_of_four"),
-    }
     return pd.DataFrame(
-        [
-            {"proxy": row["proxy"]} | {title: text(row, of) for title, (text, of) in texts.items()}
-            for row in summary.to_dict("records")
-        ]
+        {
+            "proxy": row["proxy"],
+            "real steps to learn it": tables.known_text(row["learning_steps"], ",.0f"),
+            "students": users_text(row, "student"),
+            "the same on the task": users_text(row, "same"),
+            "tuned on the task": users_text(row, "tuned"),
+            "tuned students": users_text(row, "tuned_student"),
+            "agents until it pays": paid_text(row, "break_even"),
+            "beside the same": paid_text(row, "break_even_same"),
+            "by CPU seconds": paid_text(row, "break_even_cpu"),
+            "a bandit by hand": null_text(row, "by_hand"),
+            "a bandit of the best of four": null_text(row, "best_of_four"),
+        }
+        for row in summary.to_dict("records")
     )
-
-
-def count_text(row: Mapping[Any, Any], name: str) -> str:
-    """A count; empty if it is not known."""
-    return "" if np.isnan(row[name]) else f"{row[name]:,.0f}"
 
 
 def users_text(row: Mapping[Any, Any], role: str) -> str:
@@ -205,7 +193,7 @@ def users_text(row: Mapping[Any, Any], role: str) -> str:
     if pd.isna(agent):
         return ""
     share = "" if role == "student" and row["of"] == "se" else f", {reached:.0%}"
-    return f"{figures.AGENT_NAMES[agent]}: {steps:,.0f}{share}; {mean:,.1f} ({worst:,.1f})"
+    return f"{figures.agent_name(agent)}: {steps:,.0f}{share}; {mean:,.1f} ({worst:,.1f})"
 
 
 def paid_text(row: Mapping[Any, Any], name: str) -> str:
@@ -220,22 +208,17 @@ def null_text(row: Mapping[Any, Any], source: str) -> str:
 
 
 def report(settings: BreakEven, rows: pd.DataFrame) -> pd.DataFrame:
-    summary = with_nulls(summarise(rows), settings.nulls)
+    summary = with_nulls(summarise(rows), NULLS_FOLDER)
     draw(settings, summary, unstack(rows, "curves"))
     most = summary["most_steps"].groupby(summary["task"]).first()
     limits = ", ".join(f"{name} {steps:,.0f}" for name, steps in most.items())
     note = (
-        "Agents: kind: mean training steps until ten tests in a row reach the threshold (or the "
-        "mean of an SE's students, if that is lower), the share that got there; mean return after "
-        "it, and that of the worst tenth in parentheses. An agent that never gets there counts the "
-        f"steps after which it was stopped: {limits}. Students of an SE train as long as in "
-        "learning, and take no real step. Tests of agents are left out on both sides, those of "
-        "learning the proxy count. Agents until it pays: real steps of learning over what an agent "
-        "saves beside a tuned one on the task, in brackets Fieller's 95% interval over agents (CPU "
-        "seconds: over five groups of agents); never: nothing is saved. Tuned agents are of the "
-        "kind of preset=best that pilots of other seeds found fastest; tuned students are these on "
-        "the RN. Bandits copy a policy (`experiments.null_baselines`): real steps to make one; "
-        "return of students of the same kind."
+        "Agents: mean training steps until they are stopped, the share that reached the threshold; "
+        f"mean return after it (of the worst tenth). Limits: {limits}. Students of an SE train as "
+        "long as in learning, and take no real step. Tests count in learning the proxy, not in the "
+        "agents' steps. In brackets Fieller's 95% interval over agents, of CPU seconds over five "
+        "groups of them; never: nothing is saved. Bandits: real steps to make one; return of its "
+        "students, of the same kind."
     )
     title = "From how many agents on a shipped proxy pays"
     return tables.publish(settings, title, make_table(summary), summary, note)
@@ -244,7 +227,7 @@ def report(settings: BreakEven, rows: pd.DataFrame) -> pd.DataFrame:
 def draw(settings: BreakEven, summary: pd.DataFrame, learned: pd.DataFrame) -> None:
     """Draws returns against real steps that were spent, a panel for each proxy.
 
-    Tuned agents on the task, NES runs where they are stored, and the proxy's students at its cost.
+    Tuned agents on the task, and the students of the proxy and of a bandit at its cost.
     """
     columns = min(4, len(summary))
     lines = -(-len(summary) // columns)
@@ -258,25 +241,16 @@ def draw(settings: BreakEven, summary: pd.DataFrame, learned: pd.DataFrame) -> N
             panel(axis, row, learned[learned["proxy"] == row.proxy])
         for line in axes:
             line[0].set_ylabel("return on the task")
-        named = {
-            label: handle
-            for axis in axes.flat
-            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(named.values(), named, ncols=2, loc="outside upper center", fontsize=9)
+        figures.legend_above(figure, axes[0, 0])
 
 
 def panel(axis: Any, row: Any, learned: pd.DataFrame) -> None:
-    """What one proxy costs, beside tuned agents and NES runs; bands hold half of them."""
+    """What one proxy costs, beside tuned agents; a band holds half of them."""
     grid = step_grid(row.most_steps)
-    held = curves.on_grid(learned, grid, window=1)
-    figures.band(axis, grid, held, quartiles, figures.TUNED, label="tuned agents")
+    held = curves.on_grid(learned, grid)
+    half = functools.partial(np.quantile, q=[0.25, 0.75], axis=0)
+    figures.band(axis, grid, held, half, figures.TUNED, label="tuned agents")
     lowest = pd.DataFrame(held).mean().min()  # where any of them has a return
-    path = Path(RUNS.get(row.task, ""), "rows.csv.xz")
-    if row.proxy == row.task and path.is_file():  # an evolved SE has its task's name
-        spent, scores = scores_of_runs(read_rows(path))
-        label = "NES incumbents (in-sample)"
-        figures.band(axis, spent, scores, quartiles, figures.VARIED, label=label)
     how: dict[str, Any] = {"color": figures.FIXED, "ls": "", "ms": 7}
     cost = row.learning_steps
     axis.plot(cost, row.student_return_mean, "o", label="students of the proxy", **how)
@@ -286,22 +260,6 @@ def panel(axis: Any, row: Any, learned: pd.DataFrame) -> None:
     figures.threshold(axis, row.target)
     axis.set(xscale="log", xlabel="real steps", title=row.proxy)
     axis.set_ylim(bottom=lowest - 0.05 * (row.target - lowest))
-
-
-def scores_of_runs(runs: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Incumbents' scores of NES runs `[run, point]` at real steps spent `[point]`.
-
-    A run that has ended keeps its last score, as it ends when the task is solved.
-    """
-    first = runs.groupby("seed")["env_steps_total"].min().max()
-    grid = np.geomspace(first, runs["env_steps_total"].max(), GRID_POINTS)
-    names = {"seed": "agent", "env_steps_total": "steps", "incumbent_mean": "test_return"}
-    return grid, curves.on_grid(runs.rename(columns=names), grid, window=1)
-
-
-def quartiles(values: np.ndarray) -> np.ndarray:
-    """The middle half of values `[agent, point]`: `[2, point]`."""
-    return np.quantile(values, [0.25, 0.75], axis=0)
 
 
 EXPERIMENT = Experiment(settings=BreakEven, compute=compute, report=report, about=__doc__)

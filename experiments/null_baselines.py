@@ -19,29 +19,21 @@ import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import bandits, figures, tables
-from experiments.common.agents import (
-    HPARAMS,
-    Condition,
-    Group,
-    groups_at_once,
-    kinds_of_students,
-    train_groups,
-    tuned_agent,
-)
-from experiments.common.bandits import Copied, PolicyBandit
+from experiments.common import agents, bandits, figures, tables
+from experiments.common.agents import Condition, Group, shipped
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import worst_tenth
 from sejax import envs
 from sejax.options import each_of, one_of, positive
 
+HPARAMS = ("varied", "default")
 SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
 # Two kinds of teachers for each task, and their real steps: guesses, made on other
 # seeds. How well a teacher has learned stands in the table.
@@ -101,38 +93,28 @@ class NullBaselines(Settings):
     @property
     def most_search_steps(self) -> int:
         """Real steps of a search: as many as the SE took that ships with sejax."""
-        made = [shipped.real_steps] if (shipped := shipped_se(self)) else []
-        return self.search_steps or int(*made or [1_000_000])
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of students."""
-        return self.students or kinds_of_students(self.task)
+        learning = getattr(shipped(self.env), "learning", None)
+        return self.search_steps or (learning.real_steps if learning else 1_000_000)
 
 
-def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:
-    """The tables of a source: the name of each, and what makes it."""
-    task, size, widen = settings.task, settings.num_states, settings.spread
-    seeds = range(settings.seed, settings.seed + settings.policies)
+def teachers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The policies that a source copies: the name of each, and what makes the teacher."""
+    task = settings.task
+    makes: dict[str, Callable[..., Any]] = {}  # teachers of a seed, by the beginning of their names
     if source == "by_hand" and settings.env in bandits.BY_HAND:
-        for seed in seeds:
-            make = functools.partial(bandits.copy_by_hand, task, seed, size, widen)
-            yield f"hand-{seed:02d}", make
-    elif source in ("agent", "episodes"):
-        wide = widen if source == "agent" else 0.0
-        for (kind, steps), seed in itertools.product(TEACHERS[settings.env].items(), seeds):
-            config = tuned_agent(settings.env, kind)
-            steps = settings.teacher_steps or steps
-            make = functools.partial(bandits.copy_of_agent, task, config, steps, seed, size, wide)
-            yield f"{kind}-{seed:02d}", make
-    elif source == "search":
-        steps = settings.most_search_steps
-        for seed in seeds:
-            make = functools.partial(bandits.copy_of_search, task, steps, seed, size, widen)
-            yield f"ars-{seed:02d}", make
+        makes["hand"] = functools.partial(bandits.by_hand, task)
+    if source == "search":
+        makes["ars"] = functools.partial(bandits.searched, task, settings.most_search_steps)
+    if source in ("agent", "episodes"):
+        for kind, steps in TEACHERS[settings.env].items():
+            config, steps = agents.tuned_agent(settings.env, kind), settings.teacher_steps or steps
+            makes[kind] = functools.partial(bandits.trained, task, config, steps)
+    seeds = range(settings.seed, settings.seed + settings.policies)
+    for (name, make), seed in itertools.product(makes.items(), seeds):
+        yield f"{name}-{seed:02d}", functools.partial(make, seed)
 
 
-def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Copied]) -> Any:
+def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Any]) -> Any:
     """The rows of one table, a cached shard: states `s0...`, actions `a0...`, and its costs."""
     names = ("seed", "num_states", "states", "widen", "teacher_steps")
     depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
@@ -140,17 +122,17 @@ def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[
         depends["search_steps"] = settings.most_search_steps
 
     def compute() -> pd.DataFrame:
-        made = make()
-        actions = made.actions.reshape(len(made.actions), -1)
-        columns = {f"s{i}": x for i, x in enumerate(made.states.T)}
+        widen = 0.0 if source == "episodes" else settings.spread
+        copied = bandits.copy(settings.task, make(), settings.num_states, widen)
+        actions = copied.actions.reshape(len(copied.actions), -1)
+        columns = {f"s{i}": x for i, x in enumerate(copied.states.T)}
         columns |= {f"a{i}": x for i, x in enumerate(actions.T)}
-        costs = {name: getattr(made, name) for name in COSTS}
-        return pd.DataFrame(columns | costs)
+        return pd.DataFrame(columns | {name: getattr(copied, name) for name in COSTS})
 
     return settings.shards.compute(f"table-{source}-{name}", depends, compute)
 
 
-def as_group(env: PolicyBandit, name: str, rows: pd.DataFrame) -> Group:
+def as_group(env: bandits.PolicyBandit, name: str, rows: pd.DataFrame) -> Group:
     """The bandit that rows of `make_table` describe."""
     states = rows.filter(regex=r"^s\d").to_numpy(np.float32)
     actions = rows.filter(regex=r"^a\d").to_numpy(np.float32)
@@ -160,43 +142,26 @@ def as_group(env: PolicyBandit, name: str, rows: pd.DataFrame) -> Group:
     return Group(name, env.params({"states": states, "actions": actions}), digest)
 
 
-class Shipped(NamedTuple):
-    """The SE of a task that ships with sejax, and what it took to learn it."""
-
-    env: Any
-    params: Any
-    real_steps: float
-    cpu_s: float
-
-
-def shipped_se(settings: NullBaselines) -> Shipped | None:
-    """The task's; None where there is none."""
-    rows = {proxy.name: proxy.row for proxy in sejax.pretrained()}
-    if settings.env not in rows:
-        return None
-    costs = [float(str(rows[settings.env][x]).replace(",", "")) for x in ("real steps", "CPU s")]
-    return Shipped(*sejax.load(settings.env), *costs)
-
-
 def compute(settings: NullBaselines) -> pd.DataFrame:
     """Makes the proxies and trains students on them: `makers` and `students`."""
-    bandit = PolicyBandit(settings.task)
-    made: list[dict[str, Any]] = []
+    bandit = bandits.PolicyBandit(settings.task)
+    makers: list[dict[str, Any]] = []
     students = []
     for source in settings.sources:
-        env, groups, num_agents = bandit, [], settings.num_agents
-        for name, make in makers(settings, source):
+        env: Any = bandit
+        groups, num_agents = [], settings.num_agents
+        for name, make in teachers(settings, source):
             rows = make_table(settings, source, name, make)
             groups.append(as_group(bandit, name, rows))
-            costs = rows.iloc[0][list(COSTS)]
-            made.append({"source": source, "group": name, **costs})
-        if source == "evolved" and (se := shipped_se(settings)):
-            env, groups, num_agents = se.env, [Group("shipped", se.params)], settings.num_evolved
-            costs = {"real_steps": se.real_steps, "cpu_s": se.cpu_s, "policy_return": np.nan}
-            made.append({"source": source, "group": "shipped", **costs})
+            makers.append({"source": source, "group": name, **rows.iloc[0][list(COSTS)]})
+        if source == "evolved" and (card := shipped(settings.env)):
+            env, params = sejax.load(settings.env)
+            groups, num_agents = [Group("shipped", params)], settings.num_evolved
+            costs = {name: getattr(card.learning, name, np.nan) for name in COSTS}
+            makers.append({"source": source, "group": "shipped", **costs})
         if groups:
             students.append(train_students(settings, source, env, groups, num_agents))
-    return stack({"makers": pd.DataFrame(made), "students": pd.concat(students)})
+    return stack({"makers": pd.DataFrame(makers), "students": pd.concat(students)})
 
 
 def train_students(
@@ -207,7 +172,7 @@ def train_students(
     budgets = [("default", steps) for steps in fewer if "default" in settings.hparams]
     budgets += [(hparams, most) for hparams in settings.hparams]
     found = []
-    for kind, (hparams, steps) in itertools.product(settings.kinds, budgets):
+    for kind, (hparams, steps) in itertools.product(agents.kinds_of_students(settings), budgets):
         condition = Condition(
             name=f"{source}-{kind}-{hparams}-{steps}",
             env=env,
@@ -218,8 +183,7 @@ def train_students(
             hparams=hparams,
             settings={"source": source},
         )
-        at_once = min(len(groups), groups_at_once(settings.devices))
-        rows = train_groups(condition, settings, num_agents, at_once=at_once)
+        rows = agents.train_groups(condition, settings, num_agents)
         found.append(rows.assign(source=source, kind=kind, hparams=hparams, steps=steps))
     return pd.concat(found, ignore_index=True)
 
@@ -243,15 +207,6 @@ def best_of_four(made: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(found, columns=made.columns)
 
 
-def steps_until_solved(students: pd.DataFrame, solved_reward: float) -> pd.Series:
-    """The fewest steps of each student that solve the task; inf if none does.
-
-    The students of all numbers of steps have the same seeds.
-    """
-    solves = students["steps"].where(students["test_return"] >= solved_reward, np.inf)
-    return solves.groupby([students["group"], students["agent"]]).min()
-
-
 def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each source, teacher, kind of student and of hyperparameters."""
     made, students = unstack(rows, "makers"), unstack(rows, "students")
@@ -268,7 +223,8 @@ def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         last = mine[mine["steps"] == most]
         returns = last["test_return"]
-        steps = steps_until_solved(mine, solved_reward).median()
+        solves = mine["steps"].where(mine["test_return"] >= solved_reward, np.inf)
+        steps = solves.groupby([mine["group"], mine["agent"]]).min().median()  # of equal seeds
         return tables.mean_columns(returns, "test_return", last["group"]) | {
             "median": returns.median(),
             "worst_tenth": worst_tenth(returns),
@@ -298,34 +254,26 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(settings, rows)
     draw(settings, summary)
     shown = []
-    for (source, teacher, hparams), mine in summary.groupby(
-        ["source", "teacher", "hparams"], sort=False
-    ):
+    by = ["source", "teacher", "hparams"]
+    for (source, teacher, hparams), mine in summary.groupby(by, sort=False):
         first = mine.iloc[0]
-        policy = first["policy_return"]
-        shown.append(
-            {
-                "proxy made of": label(source, teacher),
-                "real steps": f"{first['real_steps']:,.0f}",
-                "CPU s": f"{first['cpu_s']:,.2f}",
-                "the policy itself": "" if np.isnan(policy) else f"{policy:,.1f}",
-                "students": hparams,
-                **{
-                    figures.AGENT_NAMES.get(row.kind, row.kind): cell(row)
-                    for row in mine.itertuples()
-                },
-            }
-        )
+        cells = {figures.agent_name(str(row.kind)): cell(row) for row in mine.itertuples()}
+        costs = {
+            "proxy made of": label(source, teacher),
+            "real steps": f"{first['real_steps']:,.0f}",
+            "CPU s": f"{first['cpu_s']:,.2f}",
+            "the policy itself": tables.known_text(first["policy_return"], ",.1f"),
+            "students": hparams,
+        }
+        shown.append(costs | cells)
     table = pd.DataFrame(shown)
     budgets, most = settings.budgets, settings.budgets[-1]
     note = (
         f"Cells: mean return of fresh agents after {most:,} steps on the proxy (mean of the worst "
         f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
-        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). "
-        "Students' hyperparameters are their defaults, or drawn around them (varied). Real steps "
-        "are those of making one proxy, tests included; CPU seconds of bandits leave out tests and "
-        "compilation. Costs of the best of four are those of all four. A policy by hand took no "
-        "step of the real task; its tests did."
+        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). Real steps "
+        "of making one proxy have tests in them, CPU seconds of bandits neither tests nor "
+        "compilation. Costs of the best of four are those of all four."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)
@@ -336,7 +284,7 @@ def label(source: str, teacher: str) -> str:
     if source == "evolved":
         return f"{NAMES[source]} ({teacher})"
     is_taught = source in ("agent", "best_of_four", "episodes")
-    return NAMES[source] + (f": {figures.AGENT_NAMES[teacher]}" if is_taught else "")
+    return NAMES[source] + (f": {figures.agent_name(teacher)}" if is_taught else "")
 
 
 def cell(row: Any) -> str:
@@ -349,17 +297,11 @@ def cell(row: Any) -> str:
 def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
     """Students' mean returns against the real steps that a proxy cost."""
     mine = summary[summary["hparams"] == settings.hparams[0]]
+    proxies = mine.groupby(["source", "teacher"], sort=False)
     with figures.panels(settings.folder / "costs.png", 1, 1, (6.4, 3.6)) as (_, [[axes]]):
-        for i, ((source, teacher), points) in enumerate(
-            mine.groupby(["source", "teacher"], sort=False)
-        ):
-            axes.plot(
-                points["real_steps"].clip(lower=1),
-                points["test_return_mean"],
-                "osD^v<>"[i % 7],
-                color=f"C{i}",
-                label=label(source, teacher),
-            )
+        for marker, ((source, teacher), points) in zip("osD^v<>Ph*", proxies, strict=False):
+            steps, returns = points["real_steps"].clip(lower=1), points["test_return_mean"]
+            axes.plot(steps, returns, marker, label=label(source, teacher))
         figures.threshold(axes, settings.task.solved_reward)
         axes.set(xscale="log", xlabel="real steps to make the proxy", ylabel="students' return")
         axes.legend(fontsize=7)

@@ -18,12 +18,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from experiments.common import reward_networks, rn_curves
+from experiments.common import reward_networks, rn_curves, tables
 from experiments.common.experiment import Experiment, setting
 from experiments.common.rn_curves import CurveSettings
-from experiments.common.tables import publish
 from sejax.options import each_of, require
 
 PICKS = ("best", "worst")  # by their scores
@@ -67,7 +67,7 @@ class RnObjectives(CurveSettings):
 def compute(settings: RnObjectives) -> pd.DataFrame:
     """As of rn_performance; agents without an RN are there once for all objectives."""
     reward_networks.check_stored(settings, settings.objectives)
-    tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
+    parts = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:
         learned = {
             name: reward_networks.learn(settings, name, objective) for name in settings.variants
@@ -75,31 +75,29 @@ def compute(settings: RnObjectives) -> pd.DataFrame:
         for pick, (variant, rns) in itertools.product(settings.picks, learned.items()):
             picked = rns.ranked(settings.rns, worst=pick == "worst")
             made = rn_curves.rn_curves(settings, variant, picked, f"{objective}-{pick}-")
-            tables += [table.assign(objective=objective, pick=pick) for table in made]
-    return pd.concat(tables, ignore_index=True)
+            parts += [table.assign(objective=objective, pick=pick) for table in made]
+    return pd.concat(parts, ignore_index=True)
 
 
 def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     solved_reward = settings.task.solved_reward
-    summaries: list[pd.DataFrame] = []
-    tables: list[pd.DataFrame] = []
-    for objective, pick in itertools.product(settings.objectives, settings.picks):
-        mine = beside(settings, rows, objective, pick)
-        summary = rn_curves.summarise(mine, settings.max_steps)
-        table = rn_curves.make_table(summary)
-        has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
-        if not tables:
-            tables.append(table[~has_rn].assign(objective="", RNs=""))
-        tables.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
-        summaries.append(summary.assign(objective=objective, pick=pick))
+    summary = pd.concat(
+        rn_curves.summarise(beside(settings, rows, objective, pick), settings.max_steps).assign(
+            objective=objective, pick=pick
+        )
+        for objective, pick in itertools.product(settings.objectives, settings.picks)
+    )
+    has_rn = ~summary["world"].isin(rn_curves.WITHOUT_RN)
+    table = rn_curves.make_table(summary)
+    table.insert(0, "RNs", [*summary["pick"].where(has_rn, "")])
+    table.insert(0, "objective", [*summary["objective"].map(OBJECTIVE_NAMES).where(has_rn, "")])
+    table = table.iloc[np.argsort(has_rn, kind="stable")].drop_duplicates(ignore_index=True)
     for pick in settings.picks:
         curves = {
             f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
             for name in settings.objectives
         }
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
-    table = pd.concat(tables, ignore_index=True)
-    table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
         f"{settings.rns} with the highest (best) or lowest (worst) scores train "
@@ -107,7 +105,7 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         "The area is by training steps, where the authors' code has the sum."
     )
     title = f"Objectives of reward networks on {settings.env}"
-    return publish(settings, title, table, pd.concat(summaries), note)
+    return tables.publish(settings, title, table, summary, note)
 
 
 def beside(settings: RnObjectives, rows: pd.DataFrame, objective: str, pick: str) -> pd.DataFrame:

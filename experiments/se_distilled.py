@@ -10,19 +10,16 @@ included.
 
 import dataclasses
 import shlex
-import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import figures, tables
-from experiments.common.agents import CONTINUOUS, DISCRETE
+from experiments.common import agents, figures, tables
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
-from sejax import envs
 from sejax.distillation import distilling
 from sejax.distillation.config import read
 from sejax.options import each_of
@@ -40,21 +37,16 @@ class SeDistilled(Settings):
 
     env: str = setting("halfcheetah")  # task
     # Kinds of students; all that the task's preset has.
-    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
+    students: tuple[str, ...] = setting((), each_of(agents.KINDS))
     num_seeds: int = count(3, quick=2)  # whole runs of the command
     num_tested: int = count(10, quick=2)  # students of each kind on the SE that is kept
     run: tuple[str, ...] = setting(())  # overrides of the command
 
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of students."""
-        discrete = envs.make(self.env).num_actions is not None
-        return self.students or (DISCRETE if discrete else CONTINUOUS)
-
     def words(self, seed: int) -> list[str]:
         """The command's overrides for a seed."""
+        kinds = ",".join(agents.kinds_of_students(self))
         return [
-            *(f"env={self.env}", f"agents=[{','.join(self.kinds)}]", f"seed={seed}"),
+            *(f"env={self.env}", f"agents=[{kinds}]", f"seed={seed}"),
             *(f"num_tested={self.num_tested}", *(QUICK if self.quick else ()), *self.run),
         ]
 
@@ -77,9 +69,7 @@ def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
 
     def run() -> pd.DataFrame:
         folder.mkdir(parents=True, exist_ok=True)
-        started = time.process_time()
         distilling.distill(own, config, folder, shlex.join(settings.words(seed)))
-        print(f"seed {seed}: {time.process_time() - started:.0f} CPU s", flush=True)
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
@@ -121,28 +111,27 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
     shown = []
     for seed, mine in summary.groupby("seed"):
         first = mine.iloc[0]
-        cells = {
+        costs = {
             "seed": str(seed),
             "generation": f"{first['generation']:.0f}",
             "real steps": f"{first['real_steps']:,.0f}",
             "CPU s": f"{first['cpu_s']:,.0f}",
             "the policy itself": f"{first['policy_return']:,.1f}",
         }
-        for row in mine.itertuples():
-            name = figures.AGENT_NAMES[str(row.kind)]
-            cells[name] = f"{row.mean:,.1f} ± {row.std:,.1f}, worst {row.worst:,.1f}"
-        shown.append(cells)
+        cells = {
+            figures.agent_name(str(x.kind)): f"{x.mean:,.1f} ± {x.std:,.1f}, worst {x.worst:,.1f}"
+            for x in mine.itertuples()
+        }
+        shown.append(costs | cells)
     own, config = read(settings.words(settings.seed))
     search = own.search
     note = (
-        f"Each row is a run of `python -m sejax.distill`: augmented random search of a linear "
-        f"policy; {search.num_starts} searches begin with {search.start_generations} generations "
-        f"each, the best goes on to generation {search.generations}; students train on SEs of "
-        f"{own.num_snapshots} policies, and one SE is kept. Real steps and CPU seconds are those "
-        "of the whole run: all searches, students and tests. A kind's column: mean, standard "
-        f"deviation and worst of {settings.num_tested} students that took no part in choosing, "
-        f"each after {config.training.max_steps:,} steps on the SE, by the mean of "
-        f"{config.training.test_episodes} episodes on the real task."
+        f"Each row is a run of `python -m sejax.distill`: {search.num_starts} searches begin with "
+        f"{search.start_generations} generations each, the best goes on to generation "
+        f"{search.generations}; students train on SEs of {own.num_snapshots} policies, and one SE "
+        "is kept. Costs are those of the whole run. A kind's column: mean, standard deviation and "
+        f"worst of {settings.num_tested} students that took no part in choosing, each after "
+        f"{config.training.max_steps:,} steps on the SE."
     )
     title = f"SEs of {settings.env} made of a searched policy"
     return tables.publish(settings, title, pd.DataFrame(shown), summary, note)
@@ -159,11 +148,10 @@ def draw(settings: SeDistilled, rows: pd.DataFrame, path: Path) -> None:
             mine = chosen_by[chosen_by["agent"] == kind]
             ends = [mine["policy_return"].min(), mine["policy_return"].max()]
             axis.plot(ends, ends, color="0.7", lw=1, label="as good as the policy")
-            axis.plot(mine["policy_return"], mine["test_return"], "o", ms=3, alpha=0.6,
-                      color=figures.REAL, label="a student")  # fmt: skip
-            if np.isfinite(task.solved_reward):
-                axis.axhline(task.solved_reward, ls=":", lw=1, color=figures.SOLVED)
-            axis.set_title(figures.AGENT_NAMES[kind], fontsize=10)
+            dots: dict[str, Any] = {"ms": 3, "alpha": 0.6, "color": figures.REAL}
+            axis.plot(mine["policy_return"], mine["test_return"], "o", label="a student", **dots)
+            figures.threshold(axis, task.solved_reward)
+            axis.set_title(figures.agent_name(kind), fontsize=10)
             axis.set_xlabel("return of the policy")
         axes[0, 0].set_ylabel("return of students")
         axes[0, 0].legend(fontsize=8)

@@ -37,6 +37,7 @@ PAPER = {
 @dataclass(frozen=True, kw_only=True)
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
+    quick_run = runs.QUICK
 
     generations: int | None = count(None, quick=8)  # outer iterations; the preset's
     runs: int = count(10, quick=3)  # independent NES runs
@@ -54,8 +55,7 @@ def compute(settings: SeFeasibility) -> pd.DataFrame:
 
 def learning_config(settings: SeFeasibility) -> Any:
     """The configuration of the NES runs."""
-    words = [f"agent_hparams={settings.agent_hparams}"]
-    config = settings.learn_config([*words, *(runs.QUICK if settings.quick else ())])
+    config = settings.learn_config([f"agent_hparams={settings.agent_hparams}"])
     require(
         config.name("proxy") != "rn",
         "run.proxy",
@@ -64,47 +64,20 @@ def learning_config(settings: SeFeasibility) -> Any:
     return config
 
 
-def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each run: what it took to solve the task and how far it came."""
-
-    def statistics(curve: pd.DataFrame) -> dict[str, float]:
-        to_solve = runs.generations_to_solve(curve, solved_reward)
-        at_solving = curve[curve["generation"] + 1 == to_solve]
-        return {
-            "generations": len(curve),
-            "generations_to_solve": to_solve,
-            "env_steps_to_solve": at_solving["env_steps_total"].max(),
-            "best_incumbent_mean": curve["incumbent_mean"].max(),
-            "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
-            "env_steps": curve["env_steps_total"].iloc[-1],
-            "wall_min": curve["wall_s"].iloc[-1] / 60,
-        }
-
-    return tables.summary_by(curves, ["seed"], statistics)
-
-
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
-    values = np.asarray(values, float)
-
-    def text(x: float) -> str:
-        return f"{x:g}" if np.isfinite(x) else f"> {limit}"
-
-    middle, low, high = map(text, (np.median(values), values.min(), values.max()))
+    values = np.median(values), np.min(values), np.max(values)
+    middle, low, high = (f"{x:g}" if np.isfinite(x) else f"> {limit}" for x in values)
     return middle if low == high else f"{middle} ({low} to {high})"
-
-
-def median_steps(summary: pd.DataFrame) -> str:
-    """Of real steps to solve; a run that did not solve the task took more than all its steps."""
-    is_solved = np.isfinite(summary["generations_to_solve"])
-    middle = float(np.median(summary["env_steps_to_solve"].where(is_solved, np.inf)))
-    return f"{middle:,.0f}" if np.isfinite(middle) else f"> {summary['env_steps'].min():,.0f}"
 
 
 def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
     best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
-    to_solve = summary["generations_to_solve"]
+    to_solve, steps = summary["generations_to_solve"], summary["steps_to_solve"].median()
+    more = (
+        f"> {summary['steps'].min():,.0f}"  # one that did not solve it took more than all its steps
+    )
     row = pd.Series(tables.mean_columns(last, "last"))
     ours = {
         "runs": str(len(summary)),
@@ -112,7 +85,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "population": str(config.es.population_size),
         "runs with a first passage": f"{np.isfinite(to_solve).sum()} of {len(summary)}",
         "generations to the first passage": median_and_range(to_solve, config.generations),
-        "real steps to the first passage, median": median_steps(summary),
+        "real steps to the first passage, median": f"{steps:,.0f}" if np.isfinite(steps) else more,
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
         "last incumbent mean": tables.mean_text("last", 1)(row),
         "last incumbent mean, worst tenth": f"{worst_tenth(last):.1f}",
@@ -126,46 +99,30 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
 def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     config = learning_config(settings)
     solved_reward = config.task().solved_reward
-    summary = summarise(rows, solved_reward)
+    minutes = rows.groupby("seed", sort=False)["wall_s"].last() / 60
+    summary = runs.summarise(rows, ["seed"], solved_reward).assign(wall_min=minutes.to_numpy())
     draw(rows, solved_reward, settings.folder / "learning_curves.png")
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
     note = (
         f"Preset {config.preset}. An incumbent mean is over "
         f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
-        f"{config.training.test_episodes} test episodes each; the "
-        f"first passage is the first that reaches {solved_reward:g}, which does not say that fresh "
-        "agents solve the task on that SE. Median and range over runs; one "
-        "without a first passage took longer than all. The last incumbent mean: over runs. "
-        f"{tables.interval_note('runs')} The best is a maximum of noisy means and hence too high: "
-        f"se_performance tests the stored SEs with other agents.{tables.WORST_NOTE}"
+        f"{config.training.test_episodes} test episodes each; the first passage is the first that "
+        f"reaches {solved_reward:g}. Median and range over runs. {tables.interval_note('runs')} "
+        "The best is a maximum of noisy means and hence too high: se_performance tests the stored "
+        f"SEs with other agents.{tables.WORST_NOTE}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
     return tables.publish(settings, title, make_table(config, summary), summary, note)
 
 
 def draw(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
-    """Draws each run's incumbent mean as a thin line, and their mean with one std.
+    """Draws the NES runs.
 
     Source: paper, figure "Multiple NES runs of Alg. 1".
     """
-    lines = curves.pivot(index="generation", columns="seed", values="incumbent_mean")
-    lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
-    iterations = lines.index.to_numpy() + 1
-    mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
-    with figures.panels(path, 1, 1, (6, 3.6)) as (_, axes):
-        axis = axes[0, 0]
-        for index, seed in enumerate(lines.columns):
-            label = None if index else f"NES run ({lines.shape[1]} in all)"
-            axis.plot(iterations, lines[seed], color=figures.REAL, lw=0.7, alpha=0.5, label=label)
-        shade: Any = {"color": figures.REAL, "alpha": 0.15, "lw": 0}
-        axis.fill_between(
-            iterations, mean - std, mean + std, label="mean ± std of the runs", **shade
-        )
-        axis.plot(iterations, mean, color=figures.REAL, lw=2.4)
-        figures.threshold(axis, solved_reward, f"solved ({solved_reward:g})")
-        label = "mean return of the incumbent's\nagents on the real task"
-        limits = (1, max(iterations[-1], 2))
-        axis.set(xlabel="NES outer iteration", xlim=limits, ylabel=label)
+    with figures.panels(path, 1, 1, (6, 3.6)) as (_, [[axis]]):
+        figures.runs(axis, curves, solved_reward)
+        axis.set_ylabel("mean return of the incumbent's\nagents on the real task")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(fontsize=9, loc="best")
 

@@ -23,7 +23,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +39,10 @@ from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.tables import as_texts, publish, summary_by
-from sejax import ProxySet, Task
+from sejax import ProxySet, Task, TrainingConfig
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.evaluation import make_recorder, make_tested_trainer
 from sejax.options import each_of
-from sejax.training import TrainingConfig
 
 NUM_BINS, NUM_DRAWN = 2000, 80  # of the rows, and of the figure
 SOURCES = {
@@ -84,22 +83,23 @@ class SeHistograms(Settings):
     agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents, a row each
     num_agents: int = count(10, quick=3)  # of each kind
     test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None, quick=1500)  # of training; as the SE's configuration says
     max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
 
 
 def compute(settings: SeHistograms) -> pd.DataFrame:
     """Trains what is missing; a row for each bin, and one for each test."""
     ses, measure = load(settings), transitions(settings.max_rows)
-    most = groups.QUICK_STEPS if settings.quick else None
+    limits = settings.test_episodes, settings.max_steps
     tables = []
     for kind in settings.agents:
-        agent = groups.agent_config(settings, kind)
+        agent = groups.agent_config(kind)
         condition = Condition.of_set(
             ses,
             ["all"],
             name=kind,
             agent=agent,
-            training=groups.training_as_learned(ses, agent, settings.test_episodes, most),
+            training=groups.training_as_learned(ses, agent, *limits),
             exploration=ses.learned_with("exploration"),
             settings=settings.values("max_rows"),
             is_single=True,
@@ -121,9 +121,6 @@ def transitions(max_rows: int) -> Measure:
     return Measure(
         make_run=functools.partial(make_recorded_run, max_rows),
         to_table=lambda recorded, drawn: rows_of(recorded),
-        log=lambda rows: (
-            f"mean return {test_returns(rows)['reward'].mean():.1f}, {len(rows):,} transitions"
-        ),
     )
 
 
@@ -143,23 +140,19 @@ def make_recorded_run(
         next_obs, reward = predict(steps.obs, steps.action)
         episode = jnp.arange(steps.reward.shape[0]) // task.max_steps
         met = trained.recorded.rows
-
-        def source(next_obs: Any, reward: Any, episode: Any, valid: Any) -> dict[str, Any]:
-            return {"next_obs": next_obs, "reward": reward, "episode": episode, "valid": valid}
-
         is_made = jnp.arange(capacity) < trained.train_steps
-        return {
-            "train": source(met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
-            "test": source(steps.next_obs, steps.reward, episode, steps.valid),
-            "response": source(next_obs, reward, episode, steps.valid),
+        sources = {
+            "train": (met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
+            "test": (steps.next_obs, steps.reward, episode, steps.valid),
+            "response": (next_obs, reward, episode, steps.valid),
         }
+        names = ("next_obs", "reward", "episode", "valid")
+        return {source: dict(zip(names, x, strict=True)) for source, x in sources.items()}
 
     return run
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class LastSteps:
+class LastSteps(NamedTuple):
     """What a recorder keeps."""
 
     rows: Any  # `[capacity, 2 + obs_dim]` of episode, reward and next state, in no order
@@ -209,7 +202,8 @@ def binned(rows: pd.DataFrame) -> pd.DataFrame:
     A column for each source has the counts; the bin goes from `low + bin * width` on, a `width`.
     """
     tables = []
-    for (kind, mine), column in itertools.product(rows.groupby("kind", sort=False), shown(rows)):
+    shown = [*[name for name in rows if name.startswith("state_")], "reward"]
+    for (kind, mine), column in itertools.product(rows.groupby("kind", sort=False), shown):
         edges = np.histogram_bin_edges(mine[column], NUM_BINS)
         counts = {
             source: np.histogram(mine[mine["source"] == source][column], edges)[0]
@@ -221,21 +215,11 @@ def binned(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def centres(bins: pd.DataFrame) -> pd.Series:
-    """The values that bins stand for."""
-    return bins["low"] + (bins["bin"] + 0.5) * bins["width"]
-
-
 def test_returns(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each test episode of each agent, its rewards summed."""
     tests = rows[rows["source"] == "test"]
     by = [name for name in ("kind", "agent", "episode") if name in rows]
     return tests.groupby(by, sort=False, as_index=False)["reward"].sum()
-
-
-def shown(rows: pd.DataFrame) -> list[str]:
-    """The columns that are shown: those of the next state, then the reward."""
-    return [*[name for name in rows if name.startswith("state_")], "reward"]
 
 
 def names_of(task: Task, rows: pd.DataFrame) -> dict[str, str]:
@@ -269,9 +253,6 @@ def make_table(task: Task, summary: pd.DataFrame, returns: pd.DataFrame) -> pd.D
     def first(text: Callable[[str], str]) -> Callable[[Any], str]:
         return lambda row: text(row.kind) if row.dimension == next(iter(names)) else ""
 
-    def closer(row: Any) -> str:
-        return "train" if row.response_to_train < row.response_to_test else "test"
-
     def returned(kind: str) -> str:
         mine = returns[returns["kind"] == kind]["reward"]
         return f"{mine.mean():.2f} ± {mine.std():.2f}"
@@ -286,7 +267,9 @@ def make_table(task: Task, summary: pd.DataFrame, returns: pd.DataFrame) -> pd.D
             **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
             "response to train": "{response_to_train:.3g}",
             "response to test": "{response_to_test:.3g}",
-            "response is closer to": closer,
+            "response is closer to": lambda row: (
+                "train" if row.response_to_train < row.response_to_test else "test"
+            ),
         },
     )
 
@@ -298,13 +281,10 @@ def report(settings: SeHistograms, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, bins, settings.folder / "histograms.png")
     closer = int((summary["response_to_train"] < summary["response_to_test"]).sum())
     note = (
-        f"{returns['agent'].nunique()} agents a row with {settings.test_episodes} test episodes "
-        "each; the return is mean ± std over test episodes. Train: the SE's transitions met in "
-        "training; test: the real task's in greedy tests; response: the SE's from the states and "
-        "actions of those tests. Distances are Wasserstein's, in the unit of the dimension. The "
-        f"response is closer to training than to the tests in {closer} of {len(summary)} "
-        "distributions (paper: it aligns better with training, so that the SE makes the shift and "
-        "not its agents)."
+        f"{returns['agent'].nunique()} agents a row; the return is mean ± std over their test "
+        "episodes. Distances are Wasserstein's, in the unit of the dimension. The response is "
+        f"closer to training than to the tests in {closer} of {len(summary)} distributions (paper: "
+        "it aligns better with training, so that the SE makes the shift and not its agents)."
     )
     title = f"Transitions of agents trained on an SE of {task.name}"
     return publish(settings, title, make_table(task, summary, returns), summary, note)
@@ -334,7 +314,7 @@ def draw(task: Task, bins: pd.DataFrame, path: Path) -> None:
         for line, kind in zip(axes, kinds, strict=True):
             for axis, (column, name) in zip(line, names.items(), strict=True):
                 mine = bins[(bins["kind"] == kind) & (bins["dimension"] == column)]
-                values = centres(mine)
+                values = mine["low"] + (mine["bin"] + 0.5) * mine["width"]  # the middles of bins
                 samples = {s: values.repeat(mine[s].astype(int)).to_numpy() for s in SOURCES}
                 edges = bin_edges(mine, samples)
                 for source, values in samples.items():
@@ -343,7 +323,7 @@ def draw(task: Task, bins: pd.DataFrame, path: Path) -> None:
                     axis.hist(values, edges, histtype="step", lw=1.1, color=color, log=True)
                 axis.set_xlim(edges[0], edges[-1])
                 axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
-            line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")
+            line[0].set_ylabel(f"{figures.agent_name(kind)}\ntransitions")
         colors, labels = zip(*SOURCES.values(), strict=True)
         handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.6) for color in colors]
         figure.legend(handles, labels, ncols=3, loc="outside upper center")

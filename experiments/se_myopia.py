@@ -8,8 +8,8 @@ On each SE, DDQN (TD3 for continuous actions) trains with each discount, with eq
 and with the hyperparameters as it was learned with. R(d) is the return of agents with discount d on
 the real task. The unit of differences is the way from R of untrained agents to the solved return:
 
-- *dynamics*: R(0.99) - R(0) is more than `margin`;
-- *policy*: it is less, and R(0.99) is more than `margin` above R of untrained agents;
+- *dynamics*: R(0.99) - R(0) is more than `MARGIN`;
+- *policy*: it is less, and R(0.99) is more than `MARGIN` above R of untrained agents;
 - *teaches little*: R(0.99) is less than that;
 - *open*: the agents do not say.
 
@@ -17,6 +17,7 @@ More and less are those of Student's 95% interval over the agents of an SE, in p
 """
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,24 +26,14 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 import sejax
-from experiments.common import figures, tables
-from experiments.common.agents import (
-    OUTCOMES,
-    SOFT_SE,
-    Condition,
-    Group,
-    Measure,
-    groups_at_once,
-    train_groups,
-    training_as_learned,
-    tuned_agent,
-)
+from experiments.common import agents, figures, tables
+from experiments.common.agents import Condition, Group
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
-from experiments.common.statistics import mean_interval
-from sejax import ProxySet, Task, TrainingConfig, envs
+from experiments.common.statistics import mean_interval, worst_tenth
+from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
-from sejax.options import positive, registry, require
+from sejax.options import registry, require
 from sejax.proxies import header
 
 STORED = (  # below results/
@@ -51,6 +42,7 @@ STORED = (  # below results/
 )
 DISCOUNTS = (0.0, 0.5, 0.9, 0.99)
 UNTRAINED = "untrained"
+MARGIN = 0.1  # difference that counts as none, as a share of the way from untrained to solved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +51,11 @@ class SeMyopia(Settings):
 
     env: str = setting("cartpole")  # task of the SEs
     # Files of SEs, run directories or shipped names; all that are shipped and in results/.
-    ses: tuple[str, ...] = setting((), quick=("cartpole", SOFT_SE))
+    ses: tuple[str, ...] = setting((), quick=("cartpole", agents.SOFT_SE))
     num_ses: int = count(5, quick=1)  # the first SEs of each set
     num_agents: int = count(20, quick=5)  # on each SE with each discount
     test_episodes: int = count(10)  # of each agent
     max_steps: int | None = count(None, quick=1000)  # of training; as the SE's configuration says
-    # Difference that counts as none, as a share of the way from untrained agents to solved.
-    margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
 
 
 class Se(NamedTuple):
@@ -73,7 +63,7 @@ class Se(NamedTuple):
 
     set: str
     ses: ProxySet
-    place: int
+    proxy: Proxy
 
 
 def find(settings: SeMyopia) -> Iterator[Se]:
@@ -86,19 +76,15 @@ def find(settings: SeMyopia) -> Iterator[Se]:
         if header.read_config(file, "ses")["env"]["name"] == settings.env:
             ses = sejax.load_set(file, option="ses", kind="se")
             for place in range(min(len(ses), settings.num_ses)):
-                yield Se(set_name(file), ses, place)
+                yield Se(set_name(file), ses, ses[place])
 
 
 def set_name(file: str) -> str:
     """A file's name for people: of those that are one set, the folder that they are in."""
-    path = Path(file)
-    if path.suffix != ".safetensors":
-        return f"{file} (shipped)" if file in header.pretrained_names() else file
-    if path.name == "proxy.safetensors":  # of a run, one of several
-        path = path.parents[1]
-    elif path.name == "ses.safetensors":
-        path = path.parent
-    return str(path.with_suffix("")).removeprefix("results/")
+    if file in header.pretrained_names():
+        return f"{file} (shipped)"
+    ends = r"^results/|/ses\.safetensors$|/[^/]+/proxy\.safetensors$|\.safetensors$"
+    return re.sub(ends, "", file)
 
 
 def make_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Any:
@@ -113,46 +99,43 @@ def make_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Any:
     return run
 
 
-MEASURE = Measure(make_run=make_run, to_table=OUTCOMES.to_table, log=OUTCOMES.log)
+MEASURE = dataclasses.replace(agents.OUTCOMES, make_run=make_run)
 
 
 def agent_on(settings: SeMyopia, ses: ProxySet) -> Any:
     """DDQN, or TD3, as the set was learned with it; else as it is tuned for the task."""
-    kind = "td3" if ses.task.num_actions is None else "ddqn"
+    kind = agents.usual_kind(ses.task)
     for values in header.agents_of(ses.config).values():
         if values["name"] == kind:
             return registry.configure("agent", values)
-    return tuned_agent(settings.env, kind)
+    return agents.tuned_agent(settings.env, kind)
 
 
 def compute(settings: SeMyopia) -> pd.DataFrame:
     """Trains what is missing; a row for each SE, and one for each agent."""
     found = list(find(settings))
     require(found, "ses", f"must hold SEs of {settings.env}; there are none. Set env=acrobot.")
-    seen = set()  # some SEs are in several files
-    programs: dict[Any, tuple[ProxySet, dict[str, Any]]] = {}
-    for _, ses, place in found:
-        one = ses[place]
-        if one.fingerprint not in seen:
-            seen.add(one.fingerprint)
-            agent = agent_on(settings, ses)
-            training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
-            _, params = programs.setdefault((ses.env.config, agent, training), (ses, {}))
-            params[one.fingerprint] = one.params
-    first = found[0].ses
-    agents = [untrained(settings, first.task, agent_on(settings, first))]
-    for (_, agent, training), (ses, params) in programs.items():
+    distinct: dict[str, Se] = {}
+    for se in found:  # some SEs are in several files
+        distinct.setdefault(se.proxy.fingerprint, se)
+    programs: dict[Any, list[Se]] = {}
+    for se in distinct.values():
+        agent, limits = agent_on(settings, se.ses), (settings.test_episodes, settings.max_steps)
+        training = agents.training_as_learned(se.ses, agent, *limits)
+        programs.setdefault((se.ses.env.config, agent, training), []).append(se)
+    tables = [untrained(settings, found[0].ses.task, agent_on(settings, found[0].ses))]
+    for (_, agent, training), each in programs.items():
         condition = Condition(
             name="",
-            env=ses.env,
-            task=ses.task,
-            groups=tuple(Group(x, each, x) for x, each in params.items()),
+            env=each[0].ses.env,
+            task=each[0].ses.task,
+            groups=tuple(Group.of(se.proxy.fingerprint, se.proxy) for se in each),
             agent=agent,
             training=training,
-            settings={"proxy": ses.config["proxy"]},
+            settings={"proxy": each[0].ses.config["proxy"]},
         )
-        agents.append(train_with_discounts(settings, condition))
-    return stack({"ses": pd.DataFrame(map(describe, found)), "agents": pd.concat(agents)})
+        tables.append(train_with_discounts(settings, condition))
+    return stack({"ses": pd.DataFrame(map(describe, found)), "agents": pd.concat(tables)})
 
 
 def describe(se: Se) -> dict[str, Any]:
@@ -160,8 +143,8 @@ def describe(se: Se) -> dict[str, Any]:
     config = se.ses.env.config
     return {
         "set": se.set,
-        "group": se.ses[se.place].fingerprint,
-        "seed": se.ses.seeds[se.place],
+        "group": se.proxy.fingerprint,
+        "seed": se.proxy.record.get("seed", -1),
         "horizon": se.ses.env.max_steps,
         "at_limit": "ends" if config.ends_at_horizon else "cut",
         "done": "-" if config.is_bandit else config.done,
@@ -180,8 +163,7 @@ def train_with_discounts(settings: Any, condition: Condition) -> pd.DataFrame:
             groups=tuple(pairs),
             settings=condition.settings | {"discount": discount},
         )
-        at_once = groups_at_once(settings.devices)
-        rows = train_groups(sighted, settings, settings.num_agents, MEASURE, at_once)
+        rows = agents.train_groups(sighted, settings, settings.num_agents, MEASURE)
         tables.append(rows.assign(discount=discount))
     return pd.concat(tables, ignore_index=True)
 
@@ -197,25 +179,22 @@ def untrained(settings: Any, task: Task, agent: Any) -> pd.DataFrame:
             max_steps=1, max_episodes=1, stop_rule="never", test_episodes=settings.test_episodes
         ),
     )
-    return train_groups(condition, settings, settings.num_agents)
+    return agents.train_groups(condition, settings, settings.num_agents)
 
 
-def verdicts(
-    agents: pd.DataFrame, floor: float, solved_reward: float, margin: float
-) -> pd.DataFrame:
+def verdicts(agents: pd.DataFrame, floor: float, solved_reward: float) -> pd.DataFrame:
     """A row for each SE: what it loses with the least discount, and what it is.
 
     Args:
       agents: rows with the columns `group`, `discount`, `agent` and `test_return`.
       floor: mean return of untrained agents.
       solved_reward: of the task.
-      margin: share of the way between them that counts as none.
 
     Returns:
       The columns `group`, `loss` (mean difference of returns) with the ends of its interval
       `loss_low` and `loss_high`, and `verdict`.
     """
-    none = margin * (solved_reward - floor)
+    none = MARGIN * (solved_reward - floor)
     found = []
     for group, mine in agents.groupby("group", sort=False):
         returns = mine.pivot(index="agent", columns="discount", values="test_return")
@@ -233,14 +212,12 @@ def verdicts(
     return pd.DataFrame(found)
 
 
-def summarise(
-    ses: pd.DataFrame, agents: pd.DataFrame, solved_reward: float, margin: float
-) -> pd.DataFrame:
+def summarise(ses: pd.DataFrame, agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """A row for each set of SEs, with columns for each discount (`return_0_5_mean`)."""
     is_untrained = agents["group"] == UNTRAINED
     floor = agents[is_untrained]["test_return"].mean()
     agents = agents[~is_untrained]
-    judged = verdicts(agents, floor, solved_reward, margin)
+    judged = verdicts(agents, floor, solved_reward)
     far = agents[agents["discount"] == agents["discount"].max()]
 
     def statistics(mine: pd.DataFrame) -> dict[str, Any]:
@@ -261,7 +238,7 @@ def summarise(
             returns = at["test_return"]
             name = column(discount)
             columns |= tables.mean_columns(returns, name, at["group"] if len(mine) > 1 else None)
-            columns[f"{name}_worst"] = returns.nsmallest(-(-len(returns) // 10)).mean()
+            columns[f"{name}_worst"] = worst_tenth(returns)
         return columns
 
     return tables.summary_by(ses, ["set"], statistics)
@@ -269,8 +246,7 @@ def summarise(
 
 def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
-    ses, agents = unstack(rows, "ses"), unstack(rows, "agents")
-    summary = summarise(ses, agents, task.solved_reward, settings.margin)
+    summary = summarise(unstack(rows, "ses"), unstack(rows, "agents"), task.solved_reward)
     draw(settings, summary)
     shown: dict[str, Any] = {
         "SEs": "{set}",
@@ -284,21 +260,19 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
         shown[f"discount {discount:g}"] = cell(column(discount))
     shown["verdict"] = "{verdict}"
     table = tables.as_texts(summary, shown)
-    kind = figures.AGENT_NAMES["td3" if task.num_actions is None else "ddqn"]
+    kind = figures.agent_name(agents.usual_kind(task))
     least, most = DISCOUNTS[0], DISCOUNTS[-1]
     untrained = summary["untrained"].iloc[0]
-    none = settings.margin * (task.solved_reward - untrained)
+    none = MARGIN * (task.solved_reward - untrained)
     note = (
         f"{settings.num_agents} {kind} on each SE with each discount. Cells: mean return on "
         f"{task.name} (mean of the worst tenth). "
         f"{tables.interval_note('SEs, agents where there is one SE')} Steps of an episode: mean "
-        f"over the training of agents with discount {most:g}. Verdict on each SE, by Student's 95% "
-        f"interval of the difference of returns with discounts {most:g} and {least:g} over pairs "
-        f"of agents of equal seeds. Dynamics: above {none:.3g}, {settings.margin:.0%} of the way "
-        f"from untrained agents ({untrained:.1f}) to the solved return ({task.solved_reward:g}). "
-        f"Policy: below it. Teaches little: agents with discount {most:g} are less than that above "
-        "untrained ones. Open: the intervals hold both. Where episodes are one step, a discount "
-        "is of no effect."
+        f"over the training of agents with discount {most:g}. Verdict on each SE, by differences "
+        f"of {none:.3g}, {MARGIN:.0%} of the way from untrained agents ({untrained:.1f}) to the "
+        f"solved return ({task.solved_reward:g}). Dynamics: discounts {most:g} and {least:g} "
+        "differ by more. Policy: by less. Teaches little: the far-sighted are less than that above "
+        "untrained ones. Open: the intervals hold both."
     )
     title = f"Which SEs of {task.name} teach agents that look ahead less"
     return tables.publish(settings, title, table, summary, note)

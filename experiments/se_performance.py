@@ -27,9 +27,8 @@ from experiments.common import figures, tables
 from experiments.common.agents import SE_AGENTS, Condition, return_columns
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import worst_tenth
-from sejax import ProxySet, Task, envs
+from sejax import ProxySet, Task, TrainingConfig, envs
 from sejax.options import each_of, require, shortened
-from sejax.training import TrainingConfig
 
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
@@ -76,7 +75,7 @@ class SePerformance(Settings):
     test_episodes: int = count(10)  # of each agent
     max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
     varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
-    fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
+    fixed: str | None = setting(None, quick="cartpole")  # file of SEs learned with one agent's
     # Groups of agents on the real task, which is slow; as many as SEs.
     real_groups: int | None = count(None)
     # On the real task; 1000 (discrete TD3 in Acrobot 500).
@@ -94,8 +93,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
         conditions = {"real": on_real(settings, task, sets, kind)}
         conditions |= {name: on_ses(settings, ses, kind) for name, ses in sets.items()}
         for name, condition in conditions.items():
-            at_once = groups.groups_at_once(settings.devices)
-            rows = groups.train_groups(condition, settings, settings.num_agents, at_once=at_once)
+            rows = groups.train_groups(condition, settings, settings.num_agents)
             parts.append(rows.assign(kind=kind, setting=name))
     return pd.concat(parts, ignore_index=True)
 
@@ -108,8 +106,6 @@ def solved_ones(ses: ProxySet) -> Any:
 def load_sets(settings: SePerformance) -> dict[str, Any]:
     """The sets of SEs that are compared, by how they were learned; those with a file."""
     files = {name: x for name, x in settings.values("varied", "fixed").items() if x is not None}
-    if settings.quick and not files:
-        files["fixed"] = "cartpole"
     sets = {}
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
@@ -138,7 +134,7 @@ def task_name(sets: dict[str, Any]) -> str:
 
 def on_ses(settings: SePerformance, ses: ProxySet, kind: str) -> Condition:
     """The SEs of a set; agents train as long as those that the SEs were learned with."""
-    agent = groups.agent_config(settings, kind)
+    agent = groups.agent_config(kind)
     training = groups.training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
     # The weights' hash is in the name, so that sets can share a folder.
     names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
@@ -159,7 +155,7 @@ def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str
         test_episodes=settings.test_episodes,
     )
     names = [f"real-{index:02d}" for index in range(settings.real_groups or as_ses)]
-    agent = groups.agent_config(settings, kind)
+    agent = groups.agent_config(kind)
     return Condition.real(task, names, name=kind, agent=agent, training=training, hparams="varied")
 
 
@@ -206,8 +202,8 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     return tables.summary_by(agents, ["kind", "setting"], statistics)
 
 
-def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
-    """The summary as texts, with the paper's numbers."""
+def make_table(env_name: str, summary: pd.DataFrame, most: int) -> pd.DataFrame:
+    """The summary as texts, with the paper's numbers; agents on the task have `most` episodes."""
     steps = summary[summary["setting"] == "real"].set_index("kind")["train_steps_mean"]
 
     def fewer(row: Any) -> str:
@@ -222,12 +218,12 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "agent": "{kind}",
         "trained on": lambda row: SHOWN[row.setting][1],
         "SEs, agents": "{num_ses}, {num_agents}",
-        "interval over": lambda row: (
-            tables.drawn_text(row.num_agents, "agents")
-            if row.setting == "real"
-            else tables.drawn_text(row.num_ses, "SEs")
+        "interval over": lambda row: tables.drawn_text(
+            *((row.num_agents, "agents") if row.setting == "real" else (row.num_ses, "SEs"))
         ),
-        "training steps": tables.mean_text("train_steps", 0, std=True),
+        f"training steps, restricted to {most:,} episodes": tables.mean_text(
+            "train_steps", 0, std=True
+        ),
         "paper's": paper(PAPER_STEPS),
         "fewer": fewer,
         "episodes": tables.mean_text("train_episodes", 1, std=True),
@@ -249,16 +245,11 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         f"episodes each. {tables.interval_note('what its column names')} "
         '"Fewer" are training steps saved against the real task. '
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their agents and "
-        "shown by the other half. SEs are those of a set that reached the threshold, all where "
-        "none did. The paper has 40 SEs with 10 agents each, and for DDQN in CartPole a mean "
-        "return on SEs of 190.7, in another section. Agents that met a number that is not finite: "
-        f"{int(rows['nonfinite'].sum())}.{tables.WORST_NOTE}"
+        "shown by the other half. The paper has 40 SEs with 10 agents each. Agents that met a "
+        f"number that is not finite: {int(rows['nonfinite'].sum())}.{tables.WORST_NOTE}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
-    most = f"restricted to {settings.real_episodes or 1000:,} episodes"
-    table = make_table(task.name, summary).rename(
-        columns={"training steps": f"training steps, {most}"}
-    )
+    table = make_table(task.name, summary, settings.real_episodes or 1000)
     return tables.publish(settings, title, table, summary, note)
 
 
@@ -277,7 +268,7 @@ def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
         for (kind, mine), (top, *lower) in zip(kinds.items(), axes.T, strict=True):
             met = colored(mine, returns)
             figures.densities(top, met, low, high)
-            title, label = figures.AGENT_NAMES.get(kind, kind), "return of a test episode on"
+            title, label = figures.agent_name(kind), "return of a test episode on"
             top.set(title=title, xlabel=f"{label} {task.name}")
             below = [f"{values.mean():.1f}" for _, values in met]
             for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):

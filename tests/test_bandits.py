@@ -1,7 +1,6 @@
 """Bandits that copy a policy: what they pay, and the policies that they copy."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -33,17 +32,24 @@ def test_a_bandit_pays_for_the_action_of_the_table(task, actions, tried, paid):
     assert met == {0, 1}
 
 
+def by_hand(task, num_states, widen):
+    return bandits.copy(task, bandits.by_hand(task, seed=0), num_states, widen)
+
+
+GAINS = np.array([0.1, 0.3, 1.0, 0.6])
+
+
 def test_the_controller_of_cartpole_balances_and_is_copied():
-    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=64, widen=1.5)
+    copied = by_hand(CARTPOLE, num_states=64, widen=1.5)
     assert copied.policy_return == 200.0 and copied.real_steps == 2000  # ten tests, nothing else
-    u = copied.states @ np.array([0.1, 0.3, 1.0, 0.6])
-    assert (copied.actions == (u > 0)).all() and 0 < copied.actions.mean() < 1
+    assert (copied.actions == (copied.states @ GAINS > 0)).all() and 0 < copied.actions.mean() < 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task, least", [(CARTPOLE, 195.0), (CAR, 90.0)], ids=lambda x: str(x)[:8])
 def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
-    copied = bandits.copy_of_search(task, real_steps=100_000, seed=0, num_states=8, widen=0.0)
+    teacher = bandits.searched(task, real_steps=100_000, seed=0)
+    copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
     assert copied.policy_return >= least
     tests = 2 * bandits.TEST_EPISODES * 20  # of a generation, and the last ones, at least
     assert tests < copied.real_steps < 110_000
@@ -51,29 +57,28 @@ def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
 
 def test_a_search_ends_when_its_steps_are_spent():
     task = envs.make("pendulum")  # whose episodes all have 200 steps
-    copied = bandits.copy_of_search(task, real_steps=1, seed=0, num_states=8, widen=0.0)
+    teacher = bandits.searched(task, real_steps=1, seed=0)
+    copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
     one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS.num_directions + 1
     assert copied.real_steps == 200 * one_generation
     assert copied.policy_return < task.solved_reward
 
 
 def test_a_copy_of_an_agent_has_its_greedy_actions_and_its_steps():
-    import sejax
-
-    config = sejax.config(["env=cartpole", "agent=ddqn"]).agent
-    copied = bandits.copy_of_agent(CARTPOLE, config, 300, seed=0, num_states=32, widen=1.5)
+    teacher = bandits.trained(CARTPOLE, agents.tuned_agent("cartpole", "ddqn"), 300, seed=0)
+    copied = bandits.copy(CARTPOLE, teacher, num_states=32, widen=1.5)
     assert copied.states.shape == (32, 4) and set(np.unique(copied.actions)) <= {0, 1}
     tested = copied.policy_return * bandits.TEST_EPISODES  # a step is a unit of return
     assert copied.real_steps == 300 + tested
     wide, visited = copied.states[1::2], copied.states[::2]
-    assert jnp.std(wide[:, 3]) > jnp.std(visited[:, 3])
+    assert np.std(wide[:, 3]) > np.std(visited[:, 3])
 
 
 def test_a_table_of_noise_has_the_units_of_the_task_and_the_actions_of_the_policy():
-    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=512, widen=np.inf)
+    copied = by_hand(CARTPOLE, num_states=512, widen=np.inf)
     assert np.allclose(copied.states.std(0), 1, atol=0.15)  # CartPole's SEs see its own units
-    assert (copied.actions == (copied.states @ np.array([0.1, 0.3, 1.0, 0.6]) > 0)).all()
-    car = bandits.copy_by_hand(envs.make("mountain_car"), seed=0, num_states=512, widen=np.inf)
+    assert (copied.actions == (copied.states @ GAINS > 0)).all()
+    car = by_hand(envs.make("mountain_car"), num_states=512, widen=np.inf)
     assert np.allclose(car.states.std(0), [0.45, 0.035], rtol=0.15)  # half of each bound
 
 

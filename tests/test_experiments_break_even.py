@@ -8,7 +8,6 @@ import sejax
 from experiments import break_even
 from experiments.common import proxy_users
 from experiments.common.shards import stack
-from sejax import ConfigError
 
 TUNED = [900.0, 1100.0, 1000.0, 950.0, 1050.0]  # mean 1,000, variance 6,250
 
@@ -65,37 +64,26 @@ def test_students_of_an_se_take_no_real_step_and_those_of_an_rn_do():
 
 def test_the_cheapest_bandit_is_one_whose_students_are_good_enough(tmp_path, monkeypatch):
     summary = break_even.summarise(stored())
-    missing = break_even.with_nulls(summary, str(tmp_path)).iloc[0]
+    missing = break_even.with_nulls(summary, tmp_path).iloc[0]
     assert missing[["by_hand_real_steps", "best_of_four_break_even"]].isna().all()
     rows = [("by_hand", 0, 180), ("best_of_four", 9000, 190), ("best_of_four", 32_000, 199),
             ("best_of_four", 40_000, 200), ("agent", 10, 200)]  # fmt: skip
     columns = ["source", "real_steps", "test_return_mean"]
     table = pd.DataFrame(rows, columns=columns).assign(kind="ddqn", hparams="default", cpu_s=1.0)
     monkeypatch.setattr(break_even, "stored_nulls", lambda path: table)
-    found = break_even.with_nulls(summary, str(tmp_path)).iloc[0]
+    found = break_even.with_nulls(summary, tmp_path).iloc[0]
     assert found["by_hand_test_return_mean"] == 180 and found["by_hand_break_even"] == 0
     assert found["best_of_four_real_steps"] == 32_000
     assert found["best_of_four_break_even"] == 32
-    (row,) = break_even.make_table(break_even.with_nulls(summary, str(tmp_path))).to_dict("records")
+    (row,) = break_even.make_table(break_even.with_nulls(summary, tmp_path)).to_dict("records")
     assert row["agents until it pays"].startswith("1,000 [")
     assert row["a bandit of the best of four"] == "32,000; 199.0"
 
 
-def test_runs_of_nes_keep_their_last_score_when_they_have_ended():
-    runs = pd.DataFrame({"seed": [0, 0, 1, 1], "env_steps_total": [10, 100, 20, 1000],
-                         "incumbent_mean": [1.0, 5.0, 2.0, 9.0]})  # fmt: skip
-    grid, scores = break_even.scores_of_runs(runs)
-    assert grid[0] == pytest.approx(20) and grid[-1] == pytest.approx(1000)
-    np.testing.assert_array_equal(scores[:, 0], [1, 2])
-    np.testing.assert_array_equal(scores[:, -1], [5, 9])
-
-
-def test_pilots_have_other_seeds_and_costs_are_those_of_the_card():
-    with pytest.raises(ConfigError, match="pilot_seed=4"):
-        break_even.BreakEven.of(seed=3, pilot_seed=3)
-    known = {name: proxy_users.costs_of(name) for name in break_even.BreakEven.of().proxies}
+def test_costs_are_those_of_the_card():
     for card in sejax.pretrained():
-        assert known[card.name]["learning_steps"] == card.learning.real_steps > 0
+        costs = proxy_users.costs_of(card.name)
+        assert costs["learning_steps"] == card.learning.real_steps > 0
 
 
 def test_the_kind_of_agents_is_the_first_that_the_proxy_was_learned_with():

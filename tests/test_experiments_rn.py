@@ -11,7 +11,7 @@ from test_experiments import CURVES, RNS, refuse_to_compute
 
 import sejax
 from experiments import rn_heatmap, rn_objectives, rn_performance
-from experiments.common import curves, rn_curves, runs, shards
+from experiments.common import curves, rn_curves, shards
 from experiments.common import reward_networks as rn
 from experiments.common.reward_networks import STUDIES
 from experiments.common.statistics import mean_interval
@@ -42,7 +42,7 @@ def options(rns_dir, tmp_path):
 def weights_of(settings, prefix):
     """Fingerprints of the RNs that a condition used, as its settings say."""
     made_with = json.loads(lzma.decompress(settings.settings_file.read_bytes()))
-    return set(made_with[prefix]["weights"].values())
+    return {x["weights"] for name, x in made_with.items() if name.startswith(f"{prefix}-0")}
 
 
 @pytest.mark.slow
@@ -66,21 +66,18 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
     assert used == {best[0].fingerprint, best[1].fingerprint}
 
     refuse_to_compute(monkeypatch)
-    fewer = dataclasses.replace(settings, bonus_groups=1)
-    counts = run(fewer).set_index("trained with")["groups, agents"]
-    assert counts["count_based"] == "1, 2" and set(counts.drop("count_based")) == {"2, 4"}
-    expected = table[table["trained with"] != "count_based"].reset_index(drop=True)
+    counts = run(dataclasses.replace(settings, bonus_groups=1)).set_index("trained with")
+    assert counts["groups, agents"].tolist() == ["2, 4", "1, 2", "2, 4", "2, 4"]
     for nothing in (("none",), ()):
         without = run(dataclasses.replace(settings, bonuses=nothing))
+        expected = table[table["trained with"] != "count_based"].reset_index(drop=True)
         pd.testing.assert_frame_equal(without, expected)
 
 
-def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch, tmp_path):
+def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch):
     settings = options(RnPerformance)
     three = rn.learn(settings, "additive_potential", "reward_threshold")
-    before = three.path.read_bytes()
-    learned = []
-    run = session.run
+    before, run, learned = three.path.read_bytes(), session.run, []
 
     def run_and_count(config, *rest):
         learned.append(config.seed)
@@ -91,19 +88,14 @@ def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch, tmp_path):
     four = rn.learn(more, "additive_potential", "reward_threshold")
     assert learned == [6] and list(four.seeds) == [3, 4, 5, 6]
     assert list(four.scores[:3]) == list(three.scores)
-    assert [four[i].fingerprint for i in range(3)] == [three[i].fingerprint for i in range(3)]
-    assert four[3].fingerprint not in [three[i].fingerprint for i in range(3)]
-    grown = shards.read_rows(rn.curves_file(four.path))
+    assert [x.fingerprint for x in four][:3] == [x.fingerprint for x in three]
+    assert len({x.fingerprint for x in four}) == 4
+    grown = shards.read_rows(four.path.with_name("curves.csv.xz"))
     assert list(grown["seed"]) == [3, 4, 5, 6]
     three.path.write_bytes(before)  # as if killed before the set was written
     again = rn.learn(more, "additive_potential", "reward_threshold")
     assert list(again.seeds) == [3, 4, 5, 6]
-    assert shards.read_rows(rn.curves_file(four.path)).equals(grown)
-    longer = pd.DataFrame({"generation": [0, 1], "seed": 3, "incumbent_mean": 0.0})
-    monkeypatch.setattr(runs, "_learn_one", lambda *_: longer)
-    config = rn.learning_config(more, "additive_potential", "reward_threshold")
-    with pytest.raises(ConfigError, match=r"^generations must be at least 2, .*got 1\. Set"):
-        runs.learn(runs.configs_of(config, 1, tmp_path / "one"))
+    assert shards.read_rows(four.path.with_name("curves.csv.xz")).equals(grown)
 
 
 def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
@@ -156,14 +148,10 @@ def test_the_heat_map_shows_what_the_rns_pay(options):
 def test_ignored_rewards_do_not_stretch_the_colours():
     rewards = np.array([[[-101.0, 1.0]], [[-99.0, 3.0]], [[-20.0, 2.0]]])  # [rn, state, action]
     np.testing.assert_allclose(rn_heatmap.mean_rewards(rewards, ignore=False), [[0, 1]])
-    rewards = np.concatenate([rewards, [[[-60.0, 0.0]], [[-70.0, 0.0]], [[-51.0, 1.0]]]])[
-        :, :, ::-1
-    ]
-    flat = rn_heatmap.mean_rewards(np.dstack([rewards, np.full((6, 1), 41.0)]), ignore=True)
-    # Means 7/6, -20 (all others ignored) and 41, from 0 to 1.
-    np.testing.assert_allclose(flat, [[(7 / 6 + 20) / 61, 0.0, 1.0]])
-    nothing = rn_heatmap.mean_rewards(np.array([[[-60.0, 1.0, 2.0]]]), ignore=True)
-    np.testing.assert_allclose(nothing, [[np.nan, 0.0, 1.0]])
+    # Means -20 (all others ignored), 2 and 24, from 0 to 1; an action without any has none.
+    more = np.dstack([rewards, np.full((3, 1), 24.0), np.full((3, 1), -60.0)])
+    flat = rn_heatmap.mean_rewards(more, ignore=True)
+    np.testing.assert_allclose(flat, [[0.0, 0.5, 1.0, np.nan]])
 
 
 def curves_of(world, num_groups, solved_reward=-12.0):
@@ -201,28 +189,17 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
     assert np.isnan(alone["share_of_bare"][0]) and cells["of the bare agent's"] == ""
 
 
-def test_a_table_names_what_its_intervals_draw():
-    worlds = [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5),
-              curves_of("exclusive_potential", 4)]  # fmt: skip
-    summary = rn_curves.summarise(pd.concat(worlds), max_steps=300)
-    table = rn_curves.make_table(summary).set_index("trained with")
-    assert table["interval over"].to_dict() == {
-        "real": "10 agents",
-        "icm": "",
-        "additive_potential": "5 RNs",
-        "exclusive_potential": "",
-    }
-    assert (table["interval over"] != "").tolist() == [
-        "[" in cell for cell in table["mean return over training"]
-    ]
-
-
-def test_intervals_are_over_rns_or_agents_and_need_five_of_them():
-    for world, independent in (
-        ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
-        ("real", 140 + 10 * np.arange(10)),
-    ):
-        (row,) = rn_curves.summarise(curves_of(world, 5), max_steps=300).itertuples()
+@pytest.mark.parametrize(("world", "groups", "drawn", "independent"), [
+    ("real", 5, "10 agents", 140 + 10 * np.arange(10)), ("icm", 2, "", None),
+    ("additive_potential", 5, "5 RNs", 145 + 20 * np.arange(5)),  # the groups' means
+    ("exclusive_potential", 4, "", None),
+])  # fmt: skip
+def test_intervals_are_over_rns_or_agents_and_need_five_of_them(world, groups, drawn, independent):
+    summary = rn_curves.summarise(curves_of(world, groups), max_steps=300)
+    (row,), (cells,) = summary.itertuples(), rn_curves.make_table(summary).to_dict("records")
+    assert cells["interval over"] == drawn
+    assert ("[" in cells["mean return over training"]) == bool(drawn)
+    if drawn:
         assert (row.steps_low, row.steps_high) == mean_interval(independent)
         assert row.return_low < row.return_mean < row.return_high
 
@@ -231,76 +208,70 @@ def test_settings_are_those_of_the_task():
     """What is not given is the paper's, or what makes a small version of it."""
     usual = RnPerformance.of(env="cartpole")
     assert (usual.learned, usual.rns, usual.bonus_groups, usual.max_steps) == (10, 10, 10, 50_000)
-    assert usual.bonuses == ("icm",) and usual.run == ()
-    assert usual.rows == ("default", "varied", "transfer", "tuned")
+    assert usual.bonuses == ("icm",) and usual.rows == ("default", "varied", "transfer", "tuned")
     training = {row: usual.training(row) for row in usual.rows}
     assert training["default"].stop_rule == "never" and training["default"].tests_between == 1
     assert training["varied"].time_limit_is_terminal > training["tuned"].time_limit_is_terminal
     assert usual.agent("tuned") == sejax.config(["env=cartpole", "agent=ddqn"]).agent
-    mountain_car = RnPerformance.of(env="mountain_car_continuous")
-    assert mountain_car.agent("tuned").rollout_steps == 256
-    quick_td3 = mountain_car.agent("varied")
-    assert quick_td3 == sejax.config(["env=mountain_car_continuous", "proxy=rn"]).agent
-    ppo = RnPerformance.of(env="mountain_car_continuous", run=("agent=ppo",))
-    for study, variant, scale in ((mountain_car, "exclusive_non_potential", 0.1),
-                                  (mountain_car, "exclusive_potential", 1.0),
+    car = RnPerformance.of(env="mountain_car_continuous")
+    assert car.agent("tuned").rollout_steps == 256
+    assert car.agent("varied") == sejax.config([f"env={car.env}", "proxy=rn"]).agent
+    ppo = RnPerformance.of(env=car.env, run=("agent=ppo",))
+    for study, variant, scale in ((car, "exclusive_non_potential", 0.1),
+                                  (car, "exclusive_potential", 1.0),
                                   (ppo, "exclusive_non_potential", 1.0)):  # fmt: skip
         learned = rn.learning_config(study, variant, "reward_threshold").proxy
         assert (learned.variant, learned.output_scale) == (variant, scale)
-    few = RnPerformance.of(env="cartpole", learned=5, rns=2)
-    assert (few.rns, few.bonus_groups) == (2, 2) and RnPerformance.of(learned=5).rns == 5
-    assert RnObjectives.of().rns == 10 and RnObjectives.of(learned=12).rns == 6
-    picked = RnObjectives.of(quick=True)
-    assert (picked.learned, picked.rns) == (2, 1)
-    assert RnObjectives.of(quick=True, picks="best", learned=2).rns == 2
+
+
+@pytest.mark.parametrize(("settings", "given", "learned", "rns"), [
+    (RnPerformance, {"env": "cartpole", "learned": 5, "rns": 2}, 5, 2),
+    (RnPerformance, {"learned": 5}, 5, 5), (RnPerformance, {"quick": True}, 2, 2),
+    (RnObjectives, {}, 50, 10), (RnObjectives, {"learned": 12}, 12, 6),
+    (RnObjectives, {"quick": True}, 2, 1), (RnObjectives, {"quick": True, "picks": "best"}, 2, 2),
+])  # fmt: skip
+def test_no_more_rns_train_agents_than_are_learned_and_picked_apart(settings, given, learned, rns):
+    made = settings.of(**given)
+    assert (made.learned, made.rns, made.bonus_groups) == (learned, rns, rns)
 
 
 # --- the paper's tables ---------------------------------------------------------------------------
 
-# The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA and TD3
-# are not here: see `STUDIES`.
+# The tables of default hyperparameters, for agents that are trained on learned RNs, and the
+# "optimized value" of the tables of the ICM and of the count-based agents. SARSA and TD3 are not
+# here: see `STUDIES`.
 DDQN = {
     "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
     "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
     "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
 }  # fmt: skip
-AFTER_LEARNING = {
+PPO = {"discount": 0.99, "value_weight": 1, "clip_ratio": 0.2, "num_layers": 2}
+ICM = {"feature_dim": 32, "hidden_size": 128}
+PAPER = {
     ("cliff_walking", "agent"): {"learning_rate": 1.0, "discount": 0.8, "epsilon_init": 0.1,
                                  "epsilon_min": 0.1, "epsilon_decay": 0.0},
     ("cartpole", "agent"): DDQN,
     ("cartpole", "transfer_agent"): DDQN | {"feature_dim": 128, "stream_num_layers": 1,
                                             "stream_hidden_size": 128},
-    ("mountain_car_continuous", "transfer_agent"): {
-        "epochs": 80, "learning_rate": 0.0003, "update_episodes": 10, "discount": 0.99,
-        "action_repeat": 5, "value_weight": 1, "entropy_weight": 0.01, "clip_ratio": 0.2,
-        "num_layers": 2, "hidden_size": 64, "activation": "relu",
-    },
-    ("halfcheetah", "transfer_agent"): {
-        "epochs": 10, "learning_rate": 0.00001, "update_episodes": 1, "discount": 0.99,
-        "action_repeat": 1, "value_weight": 1, "entropy_weight": 0.001, "clip_ratio": 0.2,
-        "num_layers": 2, "hidden_size": 128, "activation": "tanh",
-    },
-}  # fmt: skip
-# "Optimized value" of the tables of the ICM, and of the count-based agents.
-BONUSES = {
-    "cliff_walking": {"reward_scale": 0.1},
-    "cartpole": {"learning_rate": 0.00001, "forward_weight": 0.05, "reward_scale": 0.03},
-    "mountain_car_continuous": {"learning_rate": 0.0005, "forward_weight": 0.1,
-                                "reward_scale": 0.01},
-    "halfcheetah": {"learning_rate": 0.00001, "forward_weight": 0.001, "reward_scale": 0.1},
+    ("mountain_car_continuous", "transfer_agent"): PPO | {
+        "epochs": 80, "learning_rate": 0.0003, "update_episodes": 10, "action_repeat": 5,
+        "entropy_weight": 0.01, "hidden_size": 64, "activation": "relu"},
+    ("halfcheetah", "transfer_agent"): PPO | {
+        "epochs": 10, "learning_rate": 0.00001, "update_episodes": 1, "action_repeat": 1,
+        "entropy_weight": 0.001, "hidden_size": 128, "activation": "tanh"},
+    ("cliff_walking", "bonuses"): {"reward_scale": 0.1},
+    ("cartpole", "bonuses"): ICM | {"learning_rate": 0.00001, "forward_weight": 0.05,
+                                    "reward_scale": 0.03},
+    ("mountain_car_continuous", "bonuses"): ICM | {
+        "learning_rate": 0.0005, "forward_weight": 0.1, "reward_scale": 0.01},
+    ("halfcheetah", "bonuses"): ICM | {"learning_rate": 0.00001, "forward_weight": 0.001,
+                                       "reward_scale": 0.1},
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("env", "which"), AFTER_LEARNING)
-def test_agents_after_learning_rns_are_those_of_the_papers_tables(env, which):
-    agent = getattr(STUDIES[env], which)
-    expected = AFTER_LEARNING[env, which]
-    assert {name: getattr(agent, name) for name in expected} == expected
-
-
-@pytest.mark.parametrize("env", BONUSES)
-def test_bonuses_beside_rns_are_those_of_the_papers_tables(env):
-    (bonus,) = STUDIES[env].bonuses.values()
-    assert {name: getattr(bonus, name) for name in BONUSES[env]} == BONUSES[env]
-    if env != "cliff_walking":  # an ICM
-        assert (bonus.feature_dim, bonus.hidden_size) == (32, 128)
+@pytest.mark.parametrize(("env", "which"), PAPER)
+def test_agents_and_bonuses_are_those_of_the_papers_tables(env, which):
+    config, expected = getattr(STUDIES[env], which), PAPER[env, which]
+    if which == "bonuses":
+        (config,) = config.values()
+    assert {name: getattr(config, name) for name in expected} == expected

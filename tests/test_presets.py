@@ -196,7 +196,7 @@ def test_the_best_preset_has_a_quick_ppo_for_mountain_car_continuous():
     study = STUDIES["mountain_car_continuous"]
     composed = composed_with("env=mountain_car_continuous", "proxy=rn", "agent=ppo")
     assert composed.training.max_episodes < 100 and composed.es.num_evals > 1
-    for quick in (composed.agent, study.tuned_agent()):
+    for quick in (composed.agent, study.tuned_agent):
         assert 7 * quick.rollout_length(999) < study.transfer_agent.rollout_length(999) == 1999
         freed = {"rollout_steps": None, "learning_rate": 3e-4, "init_action_std": 0.5}
         assert dataclasses.replace(quick, **freed) == study.transfer_agent

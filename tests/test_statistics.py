@@ -5,11 +5,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments.common.statistics import (
-    difference_interval,
-    mean_interval,
-    worst_tenth,
-)
+from experiments.common.statistics import difference_interval, mean_interval, worst_tenth
 from experiments.common.tables import mean_columns
 
 

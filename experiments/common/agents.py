@@ -17,19 +17,18 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings
-from sejax import Proxy, ProxySet, Task
+from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents import NoExploration
 from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
 from sejax.options.plain import to_plain
 from sejax.runs.progress import Tally
-from sejax.training import TrainingConfig
 
-HPARAMS = ("varied", "default")
 # Kinds of students, where actions are discrete and where they are continuous.
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
 CONTINUOUS = ("td3", "sac", "ppo")
+KINDS = tuple(dict.fromkeys(DISCRETE + CONTINUOUS))
 GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
 
 
@@ -39,6 +38,11 @@ class Group(NamedTuple):
     name: str  # in the names of files, and in the rows' column `group`
     params: Any  # `EnvParams`
     fingerprint: str = ""  # of the proxy's weights
+
+    @classmethod
+    def of(cls, name: str, proxy: Proxy) -> Self:
+        """A stored proxy."""
+        return cls(name, proxy.params, proxy.fingerprint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +68,8 @@ class Condition:
 
     @classmethod
     def of_set(cls, proxies: ProxySet, names: Iterable[str], **rest: Any) -> Self:
-        """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        ones = [(name, proxies[i % len(proxies)]) for i, name in enumerate(names)]
-        groups = tuple(Group(name, one.params, one.fingerprint) for name, one in ones)
+        """The proxies of a `ProxySet`, one for each group."""
+        groups = tuple(Group.of(name, proxies[i]) for i, name in enumerate(names))
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
@@ -90,7 +93,6 @@ class Measure:
     make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
     # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
-    log: Callable[[pd.DataFrame], str]  # a line about the rows of a group
     is_timed: bool = False  # whether rows have a column `cpu_s`, the cost of an agent
 
 
@@ -110,23 +112,11 @@ def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     )
 
 
-def outcome_log(rows: pd.DataFrame) -> str:
-    """A line about `outcome_rows`."""
-    mean = rows[["test_return", "train_steps"]].mean()
-    return f"mean return {mean['test_return']:.1f} after {mean['train_steps']:,.0f} steps"
-
-
-OUTCOMES = Measure(
-    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows, log=outcome_log
-)
+OUTCOMES = Measure(make_run=sejax.make_evaluator, to_table=outcome_rows)
 
 
 def train_groups(
-    condition: Condition,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure = OUTCOMES,
-    at_once: int = 1,
+    condition: Condition, settings: Settings, num_agents: int, measure: Measure = OUTCOMES
 ) -> pd.DataFrame:
     """Rows of all agents of a condition, with a column `group`; trains the missing groups.
 
@@ -138,17 +128,17 @@ def train_groups(
       settings: of the experiment.
       num_agents: of each group.
       measure: what is kept of an agent.
-      at_once: groups that are one program and finished together; see `groups_at_once`.
     """
     shared = condition.plain() | {"num_agents": num_agents, "seed": settings.seed}
     groups = {f"{condition.name}-{group.name}": group for group in condition.groups}
     names = list(groups)
+    at_once = 1 if measure.is_timed else min(len(groups), groups_at_once(settings.devices))
     tables = []
     with Tally(len(groups) * num_agents, f"agents: {condition.name}") as tally:
         for first in range(0, len(groups), at_once):
             chosen = names[first : first + at_once]
-            own = {
-                name: {"group": groups[name].name, "weights": groups[name].fingerprint}
+            made_with = {
+                name: shared | {"group": groups[name].name, "weights": groups[name].fingerprint}
                 for name in chosen
             }
 
@@ -156,13 +146,11 @@ def train_groups(
                 places = [names.index(name) for name in missing]
                 return train(condition, settings, num_agents, measure, places, at_once)
 
-            made = settings.shards.compute_all({n: shared | own[n] for n in chosen}, compute)
+            made = settings.shards.compute_all(made_with, compute)
             for name, table in zip(chosen, made, strict=True):
-                print(f"{name}: {measure.log(table)}", flush=True)
+                print(f"{name}: done", flush=True)
                 tables.append(table.assign(group=groups[name].name))
                 tally.add(num_agents)
-    weights = {group.name: group.fingerprint for group in condition.groups}
-    settings.shards.made_with[condition.name] = shared | {"weights": weights}
     return worst_for_diverged(pd.concat(tables, ignore_index=True), condition.name)
 
 
@@ -175,16 +163,10 @@ def train(
     at_once: int,
 ) -> list[pd.DataFrame]:
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
-    program = make_program(
-        measure,
-        condition.agent,
-        condition.exploration,
-        condition.hparams,
-        condition.env,
-        condition.task,
-        condition.training,
-        settings.devices,
-    )
+    task, varied = condition.task, condition.hparams == "varied"
+    agent = sejax.make_agent(condition.agent, task, condition.exploration, varied)
+    env, training = condition.env, condition.training
+    program = make_program(measure, agent, env, task, training, settings.devices)
     padded = [*places, *[places[-1]] * (at_once - len(places))]
     key = jax.random.key(settings.seed)
     own_keys = [key if condition.is_single else jax.random.fold_in(key, i) for i in padded]
@@ -209,8 +191,6 @@ def train(
 def make_program(
     measure: Measure,
     agent: Any,
-    exploration: Any,
-    hparams: str,
     env: Any,
     task: Task,
     training: TrainingConfig,
@@ -221,8 +201,7 @@ def make_program(
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
-    made = sejax.make_agent(agent, task, exploration, hparams == "varied")
-    run = measure.make_run(made, env, task, training)
+    run = measure.make_run(agent, env, task, training)
 
     def program(keys: Any, params: Any, active: Any) -> Any:
         num_groups = jax.tree.leaves(params)[0].shape[0]
@@ -230,10 +209,10 @@ def make_program(
         def one(key: Any, group: Any, active: Any) -> Any:
             place = 0 if num_groups == 1 else group  # else each agent has a copy of the weights
             mine = jax.tree.map(lambda x: x[place], params)
-            return run(key, mine, active), made.drawn_values(key)
+            return run(key, mine, active), agent.drawn_values(key)
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
-        num_parallel = num_parallel_on_cpu(made, training)
+        num_parallel = num_parallel_on_cpu(agent, training)
         spread = spread_over_devices(one, devices, cpu_num_parallel=num_parallel)
         return spread(keys, jax.numpy.asarray(groups), active)
 
@@ -259,9 +238,8 @@ def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
         return rows
     returns = ["test_return", *return_columns(rows)]
     worst = float(rows[returns].min(axis=None))
-    count = len(rows[lost].groupby([key for key in ("group", "agent") if key in rows]))
-    said = f"{count} agents diverged; their tests count as the worst return there, {worst:.1f}."
-    print(f"{name}: {said}", flush=True)
+    count = len(rows[lost].groupby(["group", "agent"]))
+    print(f"{name}: {count} agents diverged; their tests count as {worst:.1f}, the worst return.")
     return rows.fillna(dict.fromkeys(returns, worst))
 
 
@@ -286,23 +264,31 @@ def tuned_agent(env: str, kind: str) -> Any:
     return sejax.config([f"env={env}", f"agent={kind}", *words]).agent
 
 
-def kinds_of_students(task: Task) -> tuple[str, ...]:
-    """The kinds of agents that fit a task's actions; the first is the one that SEs are for."""
-    return CONTINUOUS if task.num_actions is None else DISCRETE
+def shipped(name: str) -> Any:
+    """The card of the proxy that ships with sejax under this name; None where there is none."""
+    return next((card for card in sejax.pretrained() if card.name == name), None)
+
+
+def usual_kind(task: Task) -> str:
+    """The kind of agents that SEs of a task are learned with, and tested by."""
+    return CONTINUOUS[0] if task.num_actions is None else DISCRETE[0]
+
+
+def kinds_of_students(settings: Any) -> tuple[str, ...]:
+    """The kinds in `settings.students`, or all that fit the actions of the task `settings.env`."""
+    is_discrete = envs.make(settings.env).num_actions is not None
+    return settings.students or (DISCRETE if is_discrete else CONTINUOUS)
 
 
 # --- agents on SEs -------------------------------------------------------------------------------
 
 SE_AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
-# With quick=true. Hidden sizes up to 6: one network has room for all of them.
-QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
-QUICK_STEPS = 1500
 SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
 
 
-def agent_config(settings: Settings, kind: str) -> Any:
-    """The configuration of a kind of agent."""
-    return registry.configure("agent", {"name": kind, **(QUICK_AGENT if settings.quick else {})})
+def agent_config(kind: str) -> Any:
+    """The default configuration of a kind of agent."""
+    return registry.configure("agent", {"name": kind})
 
 
 def training_as_learned(

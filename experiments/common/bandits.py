@@ -41,15 +41,9 @@ BY_HAND: dict[str, Controller] = {
         0,
     ),
     "mountain_car_continuous": lambda s: jnp.sign(s[1:2]),
-    "pendulum": lambda s: jnp.clip(
-        jnp.where(
-            s[0] > 0.8,
-            -10 * s[1] - 2 * s[2],
-            s[2] * (15 * (1 - s[0]) - s[2] ** 2 / 2),
-        ),
-        -2,
-        2,
-    )[None],
+    "pendulum": lambda s: jnp.where(
+        s[0] > 0.8, -10 * s[1] - 2 * s[2], s[2] * (15 * (1 - s[0]) - s[2] ** 2 / 2)
+    ).clip(-2, 2)[None],
 }
 BY_HAND["cartpole_v1"] = BY_HAND["cartpole"]
 
@@ -96,10 +90,9 @@ class PolicyBandit(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Array]:
         """A table of one state of zeros, where the policy does nothing."""
-        action = (
-            jnp.zeros(1, jnp.int32) if self._is_discrete else jnp.zeros((1, self.task.action_dim))
-        )
-        return {"states": jnp.zeros((1, self.task.obs_dim)), "actions": action}
+        shape, dtype = ((1,), int) if self._is_discrete else ((1, self.task.action_dim), float)
+        states, actions = jnp.zeros((1, self.task.obs_dim)), jnp.zeros(shape, dtype)
+        return {"states": states, "actions": actions}
 
     @property
     def _is_discrete(self) -> bool:
@@ -132,33 +125,41 @@ class PolicyBandit(ProxyEnv):
 # --- policies ------------------------------------------------------------------------------------
 
 
+class Teacher(NamedTuple):
+    """A policy, and what making it took; the next tests are not in it."""
+
+    agent: sejax.Agent
+    state: Any  # of the agent
+    key: Array  # of the tests and states of `copy`
+    real_steps: int
+    cpu_s: float
+
+
+def by_hand(task: Task, seed: int) -> Teacher:
+    """The controller of `BY_HAND`, which takes no step.
+
+    Raises:
+      KeyError: where there is none.
+    """
+    return Teacher(_hand(task), (), jax.random.key(seed), real_steps=0, cpu_s=0.0)
+
+
 @functools.cache
 def _hand(task: Task) -> sejax.Agent:
     policy = BY_HAND[task.name]
     return make_fixed(task, lambda key, state, obs: policy(obs))
 
 
-def copy_by_hand(task: Task, seed: int, num_states: int, widen: float) -> Copied:
-    """The controller of `BY_HAND`, whose tests are its only real steps.
-
-    Raises:
-      KeyError: where there is none.
-    """
-    key = jax.random.key(seed)
-    return copy(task, _hand(task), (), key, num_states, real_steps=0, cpu_s=0.0, widen=widen)
-
-
 @functools.cache
-def _trained(
-    task: Task, config: Any, real_steps: int, seed: int
-) -> tuple[sejax.Agent, Any, Array, float]:
-    """A teacher, its state, a key for its tests, and its CPU seconds."""
+def trained(task: Task, config: Any, real_steps: int, seed: int) -> Teacher:
+    """An agent of this configuration that trains on the real task for a number of steps."""
     agent = sejax.make_agent(config, task)
     key_train, key_copy = jax.random.split(jax.random.key(seed))
     train = _trainer(task, agent, real_steps)
     started = time.process_time()
     result = jax.block_until_ready(train(key_train, task.params))
-    return agent, result.agent_state, key_copy, time.process_time() - started
+    cpu_s = time.process_time() - started
+    return Teacher(agent, result.agent_state, key_copy, real_steps, cpu_s)
 
 
 @functools.cache
@@ -174,101 +175,11 @@ def _trainer(task: Task, agent: sejax.Agent, real_steps: int) -> Callable[..., A
     return train.lower(jax.random.key(0), task.params).compile()
 
 
-def copy_of_agent(
-    task: Task, config: Any, real_steps: int, seed: int, num_states: int, widen: float
-) -> Copied:
-    """An agent that trained on the real task for a number of steps.
-
-    Args:
-      task: the real task.
-      config: of the agent.
-      real_steps: that it trains for.
-      seed: of the training.
-      num_states: of the table.
-      widen: see `copy`.
-    """
-    agent, state, key, cpu_s = _trained(task, config, real_steps, seed)
-    return copy(task, agent, state, key, num_states, real_steps, cpu_s, widen)
-
-
-@functools.cache
-def _tested(task: Task, agent: sejax.Agent) -> Callable[[Array, Any], Any]:
-    """Compiled tests, and the steps of the same episodes."""
-    test = make_tester(agent, task, TEST_EPISODES)
-    record = make_recorder(agent, task, TEST_EPISODES)
-    return jax.jit(lambda key, state: (test(key, state), record(key, state)))
-
-
-@functools.cache
-def _greedy(agent: sejax.Agent) -> Callable[[Any, Array], Array]:
-    """Compiled actions in many states."""
-    act = functools.partial(agent.act, explore=False)
-    return jax.jit(jax.vmap(lambda state, obs: act(jax.random.key(0), state, obs), (None, 0)))
-
-
-def copy(
-    task: Task,
-    agent: sejax.Agent,
-    agent_state: Any,
-    key: Array,
-    num_states: int,
-    real_steps: int,
-    cpu_s: float,
-    widen: float,
-) -> Copied:
-    """What an agent does in states around those that it visits in its test episodes.
-
-    Args:
-      task: the real task.
-      agent: whose greedy actions are copied.
-      agent_state: its state.
-      key: of the tests and the states.
-      num_states: of the table; half of them are visited ones.
-      real_steps: what making the agent took; the test episodes are added.
-      cpu_s: likewise.
-      widen: standard deviation of the Gaussian around the visited states, in units of theirs; 0 for
-        visited states alone; inf for standard normal noise alone, in the units of the task's SEs,
-        which is where their episodes begin.
-    """
-    key_test, key_rows, key_noise = jax.random.split(key, 3)
-    tests, steps = _tested(task, agent)(key_test, agent_state)
-    visited = steps.obs[np.asarray(steps.valid)]
-    rows = jax.random.choice(key_rows, visited, (num_states,))
-    noise = jax.random.normal(key_noise, rows.shape)
-    is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
-    if np.isinf(widen):
-        states = in_task_units(task, noise)
-    else:
-        states = jnp.where(
-            is_wide & (widen > 0), visited.mean(0) + widen * (noise * visited.std(0)), rows
-        )
-    return Copied(
-        states=np.asarray(states),
-        actions=np.asarray(_greedy(agent)(agent_state, states)),
-        real_steps=real_steps + int(tests.num_steps.sum()),
-        cpu_s=cpu_s,
-        policy_return=float(tests.returns.mean()),
-    )
-
-
-def in_task_units(task: Task, noise: Array) -> Array:
-    """Noise `[state, obs_dim]` as the states in which episodes of the task's SEs begin."""
-    units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
-    return noise if units is None else units.decode(noise)
-
-
-def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, widen: float) -> Copied:
+def searched(task: Task, real_steps: int, seed: int) -> Teacher:
     """A linear policy found by augmented random search, on rollouts alone.
 
-    The search ends when the policy solves the task in `TEST_EPISODES` tests, or when the steps are
-    spent. Of all generations the one with the best tests is kept.
-
-    Args:
-      task: the real task.
-      real_steps: at most.
-      seed: of the search.
-      num_states: of the table.
-      widen: see `copy`.
+    The search ends when the policy solves the task in `TEST_EPISODES` tests, or when `real_steps`
+    are spent. Of all generations the one with the best tests is kept.
 
     Source: `sejax.distillation.policy_search`. The stored rows are of a search of the same
     algorithm with the moments of observations from random episodes before it.
@@ -284,8 +195,7 @@ def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, wide
             best, best_return = policy, float(tests.returns.mean())
         if best_return >= task.solved_reward or used >= real_steps:
             break
-    cpu_s = time.process_time() - started
-    return copy(task, agent, best, key_copy, num_states, used, cpu_s, widen)
+    return Teacher(agent, best, key_copy, used, time.process_time() - started)
 
 
 # Mania et al. search these for each task; here they are the same for all.
@@ -312,3 +222,51 @@ def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
 
     init = search.init()
     return agent, init, jax.jit(generation).lower(jax.random.key(0), init).compile()
+
+
+# --- copies --------------------------------------------------------------------------------------
+
+
+def copy(task: Task, teacher: Teacher, num_states: int, widen: float) -> Copied:
+    """What a teacher does in states around those that it visits in its test episodes.
+
+    Args:
+      task: the real task.
+      teacher: whose greedy actions are copied; its tests are further real steps.
+      num_states: of the table; half of them are visited ones.
+      widen: standard deviation of the Gaussian around the visited states, in units of theirs; 0 for
+        visited states alone; inf for standard normal noise alone, in the units of the task's SEs,
+        which is where their episodes begin.
+    """
+    test, greedy = _programs(task, teacher.agent)
+    key_test, key_rows, key_noise = jax.random.split(teacher.key, 3)
+    tests, steps = test(key_test, teacher.state)
+    visited = steps.obs[np.asarray(steps.valid)]
+    rows = jax.random.choice(key_rows, visited, (num_states,))
+    noise = jax.random.normal(key_noise, rows.shape)
+    is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
+    if np.isinf(widen):
+        units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
+        states = noise if units is None else units.decode(noise)
+    else:
+        states = jnp.where(
+            is_wide & (widen > 0), visited.mean(0) + widen * (noise * visited.std(0)), rows
+        )
+    return Copied(
+        states=np.asarray(states),
+        actions=np.asarray(greedy(teacher.state, states)),
+        real_steps=teacher.real_steps + int(tests.num_steps.sum()),
+        cpu_s=teacher.cpu_s,
+        policy_return=float(tests.returns.mean()),
+    )
+
+
+@functools.cache
+def _programs(task: Task, agent: sejax.Agent) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Compiled tests with the steps of the same episodes, and greedy actions in many states."""
+    test = make_tester(agent, task, TEST_EPISODES)
+    record = make_recorder(agent, task, TEST_EPISODES)
+    act = functools.partial(agent.act, explore=False)
+    tested = jax.jit(lambda key, state: (test(key, state), record(key, state)))
+    acts = jax.vmap(lambda state, obs: act(jax.random.key(0), state, obs), (None, 0))
+    return tested, jax.jit(acts)

@@ -4,7 +4,6 @@ A curve is a table with a row for each training episode of an agent: `agent`, `s
 steps at its end) and `test_return`, the mean of the greedy episodes after it on the real task.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,9 +11,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.agents import Measure
-from sejax import Task
+from sejax import Task, TrainingConfig
 from sejax.evaluation import make_tested_trainer
-from sejax.training import TrainingConfig
 
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
 DECIMALS = 2  # of stored test returns
@@ -25,10 +23,8 @@ def make_curve_run(
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active) -> (test returns, training steps)`, `[episode]` each.
 
-    Entries after an agent's last episode are nan and 0. Only the limits of `training` end it.
+    Entries after an agent's last episode are nan and 0.
     """
-    between = max(1, training.tests_between)
-    training = dataclasses.replace(training, stop_rule="never", tests_between=between)
 
     def make_run(agent: Any) -> Callable[..., Any]:
         train = make_tested_trainer(agent, env, task, training)
@@ -52,46 +48,32 @@ def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.D
     return pd.concat(tables, ignore_index=True)
 
 
-def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Each agent's mean of its last `window` test returns (of all, if fewer), `[agent, points]`.
+def on_grid(curves: pd.DataFrame, grid: np.ndarray) -> np.ndarray:
+    """Each agent's test return at the steps of a grid, `[agent, points]`.
 
-    The value at a step of the grid is that of the last finished episode; nan before the first.
+    It is that of the last finished episode; nan before the first.
     """
     rows = []
     for _, curve in curves.groupby("agent")[["steps", "test_return"]]:
-        values = curve["test_return"]
-        if window > 1:
-            values = values.rolling(window, min_periods=1).mean()
         place = np.searchsorted(curve["steps"].to_numpy(), grid, side="right") - 1
-        rows.append(np.where(place >= 0, values.to_numpy()[place], np.nan))
+        rows.append(np.where(place >= 0, curve["test_return"].to_numpy()[place], np.nan))
     return np.stack(rows)
 
 
-def steps_to_solve(curve: pd.DataFrame, solved_reward: float, window: int = WINDOW) -> float:
-    """Training steps of an agent until `window` tests have a mean high enough; inf if never."""
-    full = curve["test_return"].rolling(window).mean().to_numpy()
+def steps_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
+    """Training steps of an agent until `WINDOW` tests have a mean high enough; inf if never."""
+    full = curve["test_return"].rolling(WINDOW).mean().to_numpy()
     solved = np.flatnonzero(full >= solved_reward)
     return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf
-
-
-def all_steps_to_solve(curves: pd.DataFrame, solved_reward: float) -> pd.Series:
-    """The same of each agent, by agent."""
-    columns = curves.groupby("agent")[["steps", "test_return"]]
-    return columns.apply(steps_to_solve, solved_reward=solved_reward)
-
-
-def last_returns(curves: pd.DataFrame, window: int = WINDOW) -> pd.Series:
-    """Mean of each agent's last `window` test returns, by agent."""
-    return curves.groupby("agent")["test_return"].apply(lambda x: x.tail(window).mean())
 
 
 def thinned(curves: pd.DataFrame, grid: np.ndarray, solved_reward: float) -> pd.DataFrame:
     """What tables and figures need of curves: what they are at the steps of a grid.
 
-    A row says from which step of the grid on the curve has this value, and `on_grid` with a window
-    of 1 gives the same of these rows, but for what the second decimal of returns leaves out. What
-    needs all rows is in two more columns, the same in all rows of an agent: `steps_to_solve` and
-    `last_return`, the mean of its last `WINDOW` test returns.
+    A row says from which step of the grid on the curve has this value, and `on_grid` gives the same
+    of these rows, but for what the second decimal of returns leaves out. What needs all rows is in
+    two more columns, the same in all rows of an agent: `steps_to_solve` and `last_return`, the mean
+    of its last `WINDOW` test returns.
     """
     tables = []
     for _, curve in curves.groupby("agent", sort=False):
@@ -101,17 +83,15 @@ def thinned(curves: pd.DataFrame, grid: np.ndarray, solved_reward: float) -> pd.
         held = held if known.any() else curve.head(1)  # beyond the grid
         tables.append(held[held["test_return"] != held["test_return"].shift()])
     kept = pd.concat(tables, ignore_index=True)
-    whole = kept["steps"].astype(int)
+    whole, agents = kept["steps"].astype(int), curves.groupby("agent")
+    to_solve = agents[["steps", "test_return"]].apply(steps_to_solve, solved_reward=solved_reward)
+    last = agents["test_return"].apply(lambda x: x.tail(WINDOW).mean())
     return kept.assign(
         steps=whole if (whole == kept["steps"]).all() else kept["steps"],
         test_return=kept["test_return"].round(DECIMALS),
-        steps_to_solve=kept["agent"].map(all_steps_to_solve(curves, solved_reward)),
-        last_return=kept["agent"].map(last_returns(curves)),
+        steps_to_solve=kept["agent"].map(to_solve),
+        last_return=kept["agent"].map(last),
     )
 
 
-CURVES = Measure(
-    make_run=make_curve_run,
-    to_table=curve_rows,
-    log=lambda rows: f"last test returns {last_returns(rows).mean():.1f}",
-)
+CURVES = Measure(make_run=make_curve_run, to_table=curve_rows)

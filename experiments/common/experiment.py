@@ -20,43 +20,33 @@ import pandas as pd
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.ops.files import write_bytes
-from sejax.options import (
-    ConfigError,
-    Options,
-    Rule,
-    as_text,
-    counts,
-    help_texts,
-    require,
-    shortened,
-)
+from sejax.options import ConfigError, Rule, as_text, require, shortened
 from sejax.options.plain import from_plain, parsed
 from sejax.runs import commands, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
-_SAME = object()
 
 
-def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> Any:
+def setting(default: Any, rule: Rule | None = None, *, quick: Any = None) -> Any:
     """A field of `Settings`. The comment beside it is its help text.
 
     Args:
       default: its default; None where it may be left open.
       rule: what must hold, as in `sejax.options`.
-      quick: its default with `quick=true`.
+      quick: its default with `quick=true`, if it is another one.
     """
-    metadata = {"rule": rule, "quick": default if quick is _SAME else quick}
+    metadata = {"rule": rule, "quick": default if quick is None else quick}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
+def count(default: int | None, least: int = 1, *, quick: Any = None) -> Any:
     """A field that counts something, `least` of them at least."""
-    return setting(default, counts("nothing is computed otherwise", least), quick=quick)
+    return setting(default, options.counts("nothing is computed otherwise", least), quick=quick)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(options.Options):
     """The fields that every experiment has. `of` makes them; a subclass adds its own.
 
     The folder of the results holds what is kept: table, figures, learned proxies and rows. The
@@ -151,9 +141,8 @@ class Settings(Options):
         """The command that makes these results: the fields that differ from their defaults."""
         mine = self.values(*(field.name for field in dataclasses.fields(self)))
         default = self.defaults(mine) | {"quick": False}
-        hidden = NOT_SHOWN
-        if self.folder.parts[:1] != ("results",) or self.folder == self._default_folder:
-            hidden = hidden | {"out"}
+        is_kept = self.folder.parts[:1] == ("results",) and self.folder != self._default_folder
+        hidden = NOT_SHOWN if is_kept else NOT_SHOWN | {"out"}
         words = ["python", "-m", f"experiments.{self.name}"]
         for name, value in mine.items():
             if name not in hidden and value != default[name]:
@@ -229,7 +218,7 @@ class Experiment:
         """The text of `--help`: all fields with their defaults."""
         settings: Any = self.settings
         full, quick = (settings.defaults({"quick": quick}) for quick in (False, True))
-        texts, lines = help_texts(settings), []
+        texts, lines = options.help_texts(settings), []
         for name, value in full.items():
             default, other = as_text(value), as_text(quick[name])
             differs = f" (quick: {other})" if default != other else ""

@@ -10,6 +10,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from PIL import Image
 
 from sejax.ops.files import atomic_path
@@ -17,25 +18,20 @@ from sejax.ops.files import atomic_path
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"
 TUNED = "#56B4E9"
-AGENT_NAMES = {
-    "ddqn": "DDQN",
-    "dueling_ddqn": "Dueling DDQN",
-    "td3": "TD3",
-    "td3_discrete": "discrete TD3",
-    "ppo": "PPO",
-    "sac": "SAC",
-    "dqn": "DQN",
-    "q_learning": "Q-learning",
-    "sarsa": "SARSA",
-}
+AGENT_NAMES = {"dueling_ddqn": "Dueling DDQN", "td3_discrete": "discrete TD3"}
+AGENT_NAMES |= {"q_learning": "Q-learning"}  # of the others the letters are capital
 DPI = 120
-LEGEND_COLUMN = 1.4  # inches that a label with its line takes
 STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
 }
+
+
+def agent_name(kind: str) -> str:
+    """A kind of agents as people write it."""
+    return AGENT_NAMES.get(kind, kind.upper())
 
 
 def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
@@ -76,7 +72,6 @@ def bars(axis: Any, groups: list[tuple[str, np.ndarray]], below: Sequence[str]) 
         axis.bar(index, mean, color=color, alpha=0.85, width=0.7, **errors)
     axis.set_xticks(range(len(groups)), below, fontsize=8)
     axis.set_ylim(bottom=0)
-    axis.ticklabel_format(axis="y", style="plain")
     axis.yaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x >= 1000 else f"{x:g}")
 
 
@@ -88,15 +83,29 @@ def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) 
 
 
 def threshold(axis: Any, solved_reward: float, label: str | None = None) -> None:
-    """Draws the return at which the task is solved, a dashed line."""
-    axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
+    """Draws the return at which the task is solved, a dashed line; none where it is not known."""
+    if np.isfinite(solved_reward):
+        axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
 
 
 def legend_above(figure: Any, axis: Any) -> None:
     """Puts the legend of one panel above all, in four columns, if the figure is wide enough."""
     handles, labels = axis.get_legend_handles_labels()
-    columns = min(len(labels), 4, max(1, int(figure.get_figwidth() / LEGEND_COLUMN)))
+    columns = min(len(labels), 4, max(1, int(figure.get_figwidth() / 1.4)))  # inches of a label
     figure.legend(handles, labels, ncols=columns, loc="outside upper center", fontsize=9)
+
+
+def runs(axis: Any, curves: pd.DataFrame, solved_reward: float) -> None:
+    """Draws NES runs' incumbent means as thin lines, and their mean as a thick one with its std."""
+    lines = curves.pivot(index="generation", columns="seed", values="incumbent_mean")
+    lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
+    every, *others = axis.plot(lines.index + 1, lines, color=REAL, lw=0.7, alpha=0.6)
+    every.set_label(f"NES run ({len(others) + 1} in all)")
+    mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
+    axis.plot(lines.index + 1, mean, color=REAL, lw=2.4, label="mean ± std of the runs")
+    axis.fill_between(lines.index + 1, mean - std, mean + std, color=REAL, alpha=0.15, lw=0)
+    threshold(axis, solved_reward, f"solved ({solved_reward:g})")
+    axis.set(xlabel="NES outer iteration", xlim=(1, max(lines.index[-1] + 1, 2)))
 
 
 @contextlib.contextmanager

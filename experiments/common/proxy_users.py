@@ -9,30 +9,20 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import curves
-from experiments.common.agents import (
-    OUTCOMES,
-    Condition,
-    Group,
-    train_groups,
-    training_as_learned,
-    tuned_agent,
-)
+from experiments.common import agents, curves
+from experiments.common.agents import OUTCOMES, Condition, Group
 from experiments.common.experiment import Settings, count, setting
 from experiments.common.shards import stack
 from sejax import Proxy, Task, TrainingConfig, options
-from sejax.options import each_of, registry, require
+from sejax.options import each_of, registry
 from sejax.proxies.header import pretrained_names
 
 NUM_GROUPS = 5  # of agents: the CPU seconds of a group are one value
 COUNTS = (100, 20)  # agents of each sort, pilots of each kind
 COUNTS_OF = {"halfcheetah": (20, 5)}
 # Kinds of tuned agents: for discrete and continuous actions, and of tables.
-DISCRETE, CONTINUOUS, TABLES = (
-    ("ddqn", "ppo", "sac"),
-    ("td3", "sac", "ppo"),
-    ("q_learning", "sarsa"),
-)
+DISCRETE, CONTINUOUS = ("ddqn", "ppo", "sac"), ("td3", "sac", "ppo")
+TABLES = ("q_learning", "sarsa")
 MOST_STEPS = {  # of an agent on the real task or an RN; 100,000 elsewhere
     "cliff_walking": 5_000,
     "acrobot": 50_000,
@@ -59,18 +49,7 @@ class BreakEven(Settings):
     num_pilots: int | None = count(None, quick=2)
     max_steps: int | None = count(None, quick=3000)  # of an agent with real steps; by the task
     test_episodes: int = count(10)  # of each agent
-    nulls: str = setting("results/null_baselines")  # folder of their rows, by task
-    pilot_seed: int = setting(500, options.seed())  # first seed of the pilots
-    seed: int = setting(1000, options.seed())  # first seed of all others
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.pilot_seed != self.seed,
-            "pilot_seed",
-            f"must be another one than seed={self.seed}, as the pilots choose a kind of agents; "
-            f"got {self.pilot_seed}. Set pilot_seed={self.seed + 1}.",
-        )
+    seed: int = setting(1000, options.seed())  # first seed; pilots have the one 500 before
 
     def counts(self, task: Task) -> tuple[int, int]:
         """How many agents of each sort, and how many pilots."""
@@ -84,23 +63,22 @@ class BreakEven(Settings):
 
 def compute(settings: BreakEven) -> pd.DataFrame:
     """A row for each agent, learning curves of tuned agents, and what learning the proxies took."""
-    agents, drawn, costs = [], [], []
+    users, drawn, costs = [], [], []
     for name in settings.proxies:
         study = Study(settings, sejax.load_proxy(name))
-        agents += [rows.assign(proxy=name) for rows in study.agents()]
-        kind = agents[-1]["kind"].iloc[0]
+        users += [rows.assign(proxy=name) for rows in study.agents()]
+        kind = users[-1]["kind"].iloc[0]
         drawn.append(study.curves(kind).assign(proxy=name))
         costs.append(costs_of(name))
-    rows = {"agents": pd.concat(agents), "curves": pd.concat(drawn), "costs": pd.DataFrame(costs)}
+    rows = {"agents": pd.concat(users), "curves": pd.concat(drawn), "costs": pd.DataFrame(costs)}
     return stack(rows)
 
 
 def costs_of(name: str) -> dict[str, Any]:
-    """What the card says of a proxy's run; nan for what it leaves open."""
-    (card,) = (card for card in sejax.pretrained() if card.name == name)
-    learning: Any = card.learning
-    real_steps, cpu_s = (learning.real_steps, learning.cpu_s) if learning else (None, None)
-    costs = {"learning_steps": real_steps, "learning_cpu_s": cpu_s}
+    """What the card says of a proxy's run; None for what it leaves open."""
+    card = agents.shipped(name)
+    steps, cpu_s = (getattr(card.learning, x, None) for x in ("real_steps", "cpu_s"))
+    costs = {"learning_steps": steps, "learning_cpu_s": cpu_s}
     return {"proxy": name, "of": card.kind, "task": card.task, **costs}
 
 
@@ -116,9 +94,8 @@ class Study:
         self.task: Task = proxy.env.task
         self.num_agents, self.num_pilots = settings.counts(self.task)
         self.target = float(self.task.solved_reward)
-        self.kind, self.agent = next(
-            (registry.name_of("agent", agent), agent) for agent in proxy.learned_agents().values()
-        )
+        self.agent = next(iter(proxy.learned_agents().values()))
+        self.kind = registry.name_of("agent", self.agent)
 
     def agents(self) -> Iterator[pd.DataFrame]:
         """A row for each agent; the last ones are tuned ones on the real task."""
@@ -129,7 +106,7 @@ class Study:
             yield self.row("student", self.kind, self.agent, training, **more)
         else:
             more = {}
-            training = training_as_learned(proxy, self.agent, self.settings.test_episodes)
+            training = agents.training_as_learned(proxy, self.agent, self.settings.test_episodes)
             students = self.row("student", self.kind, self.agent, training)
             self.target = min(self.target, float(students["test_return"].mean()))
             yield students.assign(target=self.target)
@@ -137,18 +114,19 @@ class Study:
         yield self.row("same", self.kind, self.agent, training, **more)
         kind = yield from self.pilots()
         for role in ("tuned_student", "tuned") if is_rn else ("tuned",):
-            yield self.row(role, kind, tuned_agent(self.task.name, kind), self.until_solved())
+            yield self.row(
+                role, kind, agents.tuned_agent(self.task.name, kind), self.until_solved()
+            )
 
     def pilots(self) -> Generator[pd.DataFrame, None, str]:
         """Agents of each kind, one group of other seeds; returns the kind that is fastest."""
-        settings = dataclasses.replace(
-            self.settings, seed=self.settings.pilot_seed, pilot_seed=self.settings.seed
-        )
+        seed = (self.settings.seed - 500) % 2**31
+        settings = dataclasses.replace(self.settings, seed=seed)
         steps = {}
         for kind in kinds_for(self.task):
-            agent = tuned_agent(self.task.name, kind)
+            agent = agents.tuned_agent(self.task.name, kind)
             condition = self.condition(f"pilot-{kind}", agent, self.until_solved(), num_groups=1)
-            rows = train_groups(condition, settings, self.num_pilots, TIMED)
+            rows = agents.train_groups(condition, settings, self.num_pilots, TIMED)
             yield self.labelled(rows, "pilot", kind)
             steps[kind] = rows["train_steps"].mean()
         return min(steps, key=steps.__getitem__)
@@ -156,8 +134,8 @@ class Study:
     def curves(self, kind: str) -> pd.DataFrame:
         """Learning curves of tuned agents on the real task, thinned."""
         training = dataclasses.replace(self.until_solved(), stop_rule="never")
-        condition = self.condition("curves", tuned_agent(self.task.name, kind), training, 1)
-        rows = train_groups(condition, self.settings, self.num_pilots, curves.CURVES)
+        condition = self.condition("curves", agents.tuned_agent(self.task.name, kind), training, 1)
+        rows = agents.train_groups(condition, self.settings, self.num_pilots, curves.CURVES)
         grid = step_grid(self.settings.limit(self.task))
         return curves.thinned(rows.drop(columns="group"), grid, self.target)
 
@@ -179,7 +157,7 @@ class Study:
         """Agents of one sort, in five groups."""
         condition = self.condition(role, agent, training, **more)
         each = self.num_agents // NUM_GROUPS
-        return self.labelled(train_groups(condition, self.settings, each, TIMED), role, kind)
+        return self.labelled(agents.train_groups(condition, self.settings, each, TIMED), role, kind)
 
     def condition(
         self,

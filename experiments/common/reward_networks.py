@@ -15,7 +15,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,8 @@ from experiments.common import agents, figures, runs
 from experiments.common.experiment import count, setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
-from sejax import ICMConfig, options
-from sejax.options import ConfigError, listed, one_of, registry
+from sejax import ICMConfig
+from sejax.options import ConfigError, each_of, listed, one_of, registry
 from sejax.options.plain import flatten
 from sejax.runs import config as configuration
 from sejax.runs import run_directory
@@ -44,15 +44,6 @@ AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observat
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
 PAPER_ROWS = ("default", "varied", "transfer")
 OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
-# With quick=true.
-QUICK: dict[str, Any] = {
-    "learned": 2,
-    "generations": 4,
-    "rns": 2,
-    "num_agents": 4,
-    "max_steps": 1500,
-    "run": ("es.population_size=8",),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +52,7 @@ class Study:
 
     agent: Any  # of the rows with default and varied hyperparameters; None: that of `preset=best`
     transfer_agent: Any  # of the row with an unseen agent
-    # Makes the one that was tuned on the real task for few steps, if it is another one.
-    tuned_agent: Callable[[], Any] | None = None
+    tuned_agent: Any = None  # on the real task for few steps, if it is another one
     rows: tuple[str, ...] = PAPER_ROWS  # of the figure
     bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
@@ -101,7 +91,7 @@ STUDIES = {
         transfer_agent=sejax.DuelingDDQNConfig(
             **_CARTPOLE, feature_dim=128, stream_hidden_size=128
         ),
-        tuned_agent=functools.partial(agents.tuned_agent, "cartpole", "ddqn"),
+        tuned_agent=agents.tuned_agent("cartpole", "ddqn"),
         rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000,
@@ -111,12 +101,8 @@ STUDIES = {
         agent=None,
         transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
         # docs/agents.md, "PPO"
-        tuned_agent=functools.partial(
-            sejax.PPOConfig.paper,
-            action_repeat=5,
-            rollout_steps=256,
-            learning_rate=0.0015,
-            init_action_std=1.0,
+        tuned_agent=sejax.PPOConfig.paper(
+            action_repeat=5, rollout_steps=256, learning_rate=0.0015, init_action_std=1.0
         ),
         rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
@@ -168,26 +154,28 @@ def label(name: str) -> str:
 class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
+    quick_run = ("es.population_size=8",)
+
     # Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
     env: str = setting("cliff_walking", one_of(STUDIES))
     # Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.
     variants: tuple[str, ...] = setting(VARIANTS)
-    learned: int = count(10)  # RNs to learn of each variant
+    learned: int = count(10, quick=2)  # RNs to learn of each variant
+    generations: int | None = count(None, quick=4)  # outer iterations; the preset's
     rns_dir: str | None = setting(None)  # of RNs; results/reward_networks, quick: rns/ in `out`
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        default = super().defaults(given)
+        usual, default = super().defaults({}), super().defaults(given)
         env = given.get("env", default["env"])
-        options.one_of(STUDIES)("env", env, "cliff_walking")
-        study = STUDIES[env]
-        values = vars(study) | {"bonuses": tuple(study.bonuses)}
-        values |= QUICK if given.get("quick") else {}
-        return default | {name: values[name] for name in default.keys() & values.keys()}
+        one_of(STUDIES)("env", env, "cliff_walking")
+        study = vars(STUDIES[env]) | {"bonuses": tuple(STUDIES[env].bonuses)}
+        same = [name for name in default if name in study and default[name] == usual[name]]
+        return default | {name: study[name] for name in same}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        options.each_of(self.study.variants)("variants", self.variants, None)
+        each_of(self.study.variants)("variants", self.variants, None)
 
     @property
     def study(self) -> Study:
@@ -230,7 +218,8 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         print(f"{variant}: learns {missing} RNs, {config.generations} generations each", flush=True)
         curve = runs.learn(configs, option="rns_dir")
         curve = curve[curve.columns.intersection(KEPT)].assign(variant=variant)
-        if (file := curves_file(path)).exists():
+        file = path.with_name("curves.csv.xz")  # of all variants
+        if file.exists():
             before = read_rows(file)  # with those beyond, if stopped right here
             first = config.seed if there else 0
             is_anew = (before["variant"] == variant) & (before["seed"] >= first)
@@ -246,11 +235,6 @@ def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
     return settings.rns_folder / settings.env / objective / f"{variant}.safetensors"
 
 
-def curves_file(path: Path) -> Path:
-    """Where the curves of the NES runs of a set are kept, beside those of the other variants."""
-    return path.with_name("curves.csv.xz")
-
-
 def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs that are there already, a `ProxySet`; None if they are to be learned.
 
@@ -264,8 +248,8 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     there = sejax.load_set(path, option="rns_dir", kind="rn")
     made_with = _what_counts(configuration.learn_config(there.config))
     asked = _what_counts(learning_config(settings, variant, objective))
-    names = sorted(made_with.keys() | asked.keys())
-    differing = [name for name in names if made_with.get(name) != asked.get(name)]
+    names = made_with.keys() | asked.keys()
+    differing = sorted(name for name in names if made_with.get(name) != asked.get(name))
     if differing == ["generations"] and made_with["generations"] < asked["generations"]:
         return None
     if differing:

@@ -13,23 +13,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.common import agents, curves, figures
+from experiments.common import agents, curves, figures, tables
 from experiments.common.agents import Condition
 from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.statistics import worst_tenth
-from experiments.common.tables import (
-    WORST_NOTE,
-    as_texts,
-    drawn_text,
-    interval_note,
-    mean_columns,
-    mean_text,
-    summary_by,
-)
-from sejax import ProxySet
+from sejax import ProxySet, TrainingConfig
 from sejax.options import each_of, registry, require
-from sejax.training import TrainingConfig
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
     "default": "default hyperparameters",
@@ -53,10 +43,10 @@ class CurveSettings(RnSettings):
     # Exploration bonuses on the real task to compare with: count_based on cliff_walking, elsewhere
     # icm; or none.
     bonuses: tuple[str, ...] = setting(())
-    rns: int = count(10)  # RNs of each variant that agents are trained on, the best
+    rns: int = count(10, quick=2)  # RNs of each variant that agents are trained on, the best
     bonus_groups: int = count(10)  # groups of agents with a bonus; as many as RNs
-    num_agents: int = count(10)  # on each RN, in each row
-    max_steps: int = count(5000)  # of training; as the paper's figure
+    num_agents: int = count(10, quick=4)  # on each RN, in each row
+    max_steps: int = count(5000, quick=1500)  # of training; as the paper's figure
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -79,7 +69,7 @@ class CurveSettings(RnSettings):
         if row == "transfer":
             return self.study.transfer_agent
         if row == "tuned" and self.study.tuned_agent:
-            return self.study.tuned_agent()
+            return self.study.tuned_agent
         return self.study.agent or self.learning_agent
 
     def training(self, row: str) -> TrainingConfig:
@@ -154,21 +144,21 @@ def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
         each = mine.groupby("agent").first()
         groups, to_solve = each["group"], each["steps_to_solve"]
         steps = to_solve.clip(upper=max_steps)
-        held = curves.on_grid(mine, grid, window=1)
+        held = curves.on_grid(mine, grid)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         labels = None if world in WITHOUT_RN else groups
         counted[row, world] = steps, groups
         return (
             {"groups": groups.nunique(), "agents": len(steps)}
             | {"solved": np.isfinite(to_solve).mean()}
-            | mean_columns(steps, "steps", labels)
-            | mean_columns(mean_return, "return", labels)
+            | tables.mean_columns(steps, "steps", labels)
+            | tables.mean_columns(mean_return, "return", labels)
             | {"return_worst_tenth": worst_tenth(mean_return)}
             | {"steps_restricted_to": max_steps}
             | {"last_return": each["last_return"].mean()}
         )
 
-    summary = summary_by(rows, ["row", "world"], statistics)
+    summary = tables.summary_by(rows, ["row", "world"], statistics)
     shares = [
         share_of_bare(*mine, *counted[row, "real"]) if (row, "real") in counted else np.nan
         for (row, _), mine in counted.items()
@@ -194,25 +184,20 @@ def step_grid(max_steps: int) -> np.ndarray:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
 
-    def share(row: Any) -> str:
-        return f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else ""
-
     most = summary["steps_restricted_to"].iloc[0]
-    return as_texts(
+    return tables.as_texts(
         summary,
         {
             "agents": lambda row: ROWS[row.row],
             "trained with": "{world}",
             "groups, agents": "{groups}, {agents}",
-            "interval over": lambda row: (
-                drawn_text(row.agents, "agents")
-                if row.world in WITHOUT_RN
-                else drawn_text(row.groups, "RNs")
+            "interval over": lambda row: tables.drawn_text(
+                *((row.agents, "agents") if row.world in WITHOUT_RN else (row.groups, "RNs"))
             ),
-            f"steps to solve, restricted to {most:,}": mean_text("steps", 0),
-            "of the bare agent's": share,
+            f"steps to solve, restricted to {most:,}": tables.mean_text("steps", 0),
+            "of the bare agent's": lambda row: tables.known_text(row.share_of_bare, ".0%"),
             "solved": "{solved:.0%}",
-            "mean return over training": mean_text("return", 1),
+            "mean return over training": tables.mean_text("return", 1),
             "worst tenth": "{return_worst_tenth:.1f}",
             "last tests": "{last_return:.1f}",
         },
@@ -228,8 +213,8 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
         "seeds. Curves that end early go on as the last test. "
-        f"{interval_note('what its column names')}"
-        f"{WORST_NOTE}{'' if settings.study.agent else learned_with}"
+        f"{tables.interval_note('what its column names')}"
+        f"{tables.WORST_NOTE}{'' if settings.study.agent else learned_with}"
     )
 
 
@@ -247,7 +232,7 @@ def draw(settings: Any, rows: dict[str, pd.DataFrame], height: float, name: str)
                 panel(axis, mine[mine["row"] == row], settings.max_steps, solved_reward)
             line[0].set_ylabel(label)
         for axis, row in zip(axes[0], settings.rows, strict=True):
-            agent = figures.AGENT_NAMES[registry.name_of("agent", settings.agent(row))]
+            agent = figures.agent_name(registry.name_of("agent", settings.agent(row)))
             axis.set_title(f"{agent}, {ROWS[row]}", fontsize=10)
         for axis in axes[-1]:
             axis.set_xlabel("training steps")
@@ -265,7 +250,7 @@ def panel(axis: Any, rows: pd.DataFrame, max_steps: int, solved_reward: float) -
         name = str(world)
         style = "--" if name in WITHOUT_RN[1:] else ":" if AUGMENTED in name else "-"
         color, _ = SHOWN[name.removesuffix(AUGMENTED)]
-        held, line = curves.on_grid(mine, grid, window=1), {"ls": style, "lw": 1.6}
+        held, line = curves.on_grid(mine, grid), {"ls": style, "lw": 1.6}
         figures.band(axis, grid, held, standard_errors, color, label=label(name), **line)
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
 

@@ -4,12 +4,13 @@ Each run is that of `python -m sejax.run` with the same configuration and seed, 
 of its own: one that was stopped goes on, and a finished one is kept.
 """
 
+import copy
 import dataclasses
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, setting
+from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
 from sejax.runs import config as configuration
@@ -39,6 +41,8 @@ QUICK = (
 class RunSettings(Settings):
     """Settings about the NES runs."""
 
+    quick_run: ClassVar[tuple[str, ...]] = ()  # overrides of the NES runs with quick=true
+
     env: str = setting("cartpole")  # task: cartpole, acrobot, ...
     generations: int | None = count(None)  # outer iterations; the preset's
     preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
@@ -46,7 +50,8 @@ class RunSettings(Settings):
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""
-        words = [f"env={self.env}", f"preset={self.preset}", *overrides]
+        quick = self.quick_run if self.quick else ()
+        words = [f"env={self.env}", f"preset={self.preset}", *quick, *overrides]
         if self.generations is not None:
             words.append(f"generations={self.generations}")
         config = sejax.config([*words, *self.run])
@@ -62,9 +67,7 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
 
 
 def learn(
-    configs: list[Any],
-    option: str = "work",
-    chunks: session.Chunks | None = None,
+    configs: list[Any], option: str = "work", chunks: session.Chunks | None = None
 ) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
@@ -84,38 +87,21 @@ def learn(
     with Tally(len(configs), "NES runs") as tally:
         for config in configs:
             with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
-                curve = _learn_one(config, directory, chunks)
-            _require_no_more(config, curve)
-            print(f"{config.run_dir}: {_log(curve, chunks.learner.solved_score)}", flush=True)
-            curves.append(curve)
+                path = directory.path / "cpu_s.txt"
+                session.run(config, directory, timed(chunks, path))
+                curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
+            there = int(curve["generation"].max()) + 1 if len(curve) else 0
+            require(
+                there <= config.generations,
+                "generations",
+                f"must be at least {there}, as the run in {config.run_dir} has so many; got "
+                f"{config.generations}. Set generations={there}, or another folder.",
+            )
+            best = curve["best_so_far"].max()
+            print(f"{config.run_dir}: {there} generations, best {best:.1f}", flush=True)
+            curves.append(curve.assign(cpu_s=pd.Series(read_costs(path, len(curve)))))
             tally.add()
     return pd.concat(curves, ignore_index=True)
-
-
-def _learn_one(config: Any, directory: Any, chunks: session.Chunks) -> pd.DataFrame:
-    path = directory.path / "cpu_s.txt"
-    session.run(config, directory, TimedChunks(chunks, path))
-    curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)  # those of the verified checkpoint
-    return curve.assign(cpu_s=pd.Series(read_costs(path, len(curve))))
-
-
-def _require_no_more(config: Any, curve: pd.DataFrame) -> None:
-    there = int(curve["generation"].max()) + 1 if len(curve) else 0
-    require(
-        there <= config.generations,
-        "generations",
-        f"must be at least {there}, as the run in {config.run_dir} has so many; got "
-        f"{config.generations}. Set generations={there}, or another folder.",
-    )
-
-
-def _log(curve: pd.DataFrame, solved_score: float | None) -> str:
-    best = f"best {curve['best_so_far'].max():.1f}"
-    if solved_score is None:
-        return best
-    solved = generations_to_solve(curve, solved_score)
-    first = f"{solved:.0f}" if np.isfinite(solved) else "none"
-    return f"{best}, first passage of the threshold in generation {first} of {len(curve)}"
 
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
@@ -138,31 +124,55 @@ def generations_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
     return float(solved.iloc[0]) + 1 if len(solved) else np.inf
 
 
+def summarise(curves: pd.DataFrame, by: Sequence[str], solved_reward: float) -> pd.DataFrame:
+    """A row for each run, told apart by the columns `by`: how far it came, and what that took.
+
+    What it took until the first incumbent that solves the task is inf for a run without one; CPU
+    seconds are nan where the curves have none.
+    """
+
+    def statistics(curve: pd.DataFrame) -> dict[str, float]:
+        to_solve = generations_to_solve(curve, solved_reward)
+        costs = curve[["env_steps_total"]].assign(cpu_s=curve.get("cpu_s", np.nan))
+        spent = costs[curve["generation"] < to_solve]
+        is_solved = np.isfinite(to_solve)
+        return {
+            "generations": len(curve),
+            "generations_to_solve": to_solve,
+            "steps_to_solve": spent["env_steps_total"].max() if is_solved else np.inf,
+            "cpu_s_to_solve": spent["cpu_s"].sum(min_count=1) if is_solved else np.inf,
+            "best_incumbent_mean": curve["incumbent_mean"].max(),
+            "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
+            "steps": curve["env_steps_total"].max(),
+            "cpu_s": costs["cpu_s"].mean(),
+        }
+
+    return summary_by(curves, by, statistics)
+
+
 # --- what generations cost -----------------------------------------------------------------------
 
 
-class TimedChunks(session.Chunks):
-    """Compiled generations that write down their CPU seconds.
+def timed(chunks: session.Chunks, path: Path) -> session.Chunks:
+    """The same compiled generations, which write down their CPU seconds.
 
     CPU seconds are those of this process on all of its threads, while it computes a generation:
     compilation, files and figures are left out. Costs are written before the generation itself is;
     after a kill there may be one too many, which the run writes again as it goes on.
     """
 
-    def __init__(self, chunks: session.Chunks, path: Path):
-        super().__init__(chunks.learner)
-        self._compiled = chunks._compiled  # shared by all runs
-        self._path = path
-
-    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
-        """Runs `length` generations."""
-        before = read_costs(self._path, int(state.generation))
+    def advance(state: Any, length: int) -> tuple[Any, Any]:
+        before = read_costs(path, int(state.generation))
         started = time.process_time()
-        result = jax.block_until_ready(super().advance(state, length))
+        result = jax.block_until_ready(chunks.advance(state, length))
         each = (time.process_time() - started) / length
         costs = np.concatenate([before, np.full(length, each)])
-        write_text(self._path, "".join(f"{cost:.3f}\n" for cost in costs))
+        write_text(path, "".join(f"{cost:.3f}\n" for cost in costs))
         return result
+
+    writing = copy.copy(chunks)
+    writing.advance = advance  # type: ignore[method-assign]
+    return writing
 
 
 def read_costs(path: Path, generations: int) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 A shard is a table that takes minutes to compute (the agents of one SE). It is written as soon as it
 is computed, so that the same command computes only what is missing. Its file is a CSV file below a
-line with a checksum and the settings that it was computed with.
+line with the settings that it was computed with. All files are compressed by xz, which keeps a
+checksum.
 """
 
-import hashlib
 import io
 import json
 import lzma
@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.ops.files import atomic_path, write_text
+from sejax.ops.files import atomic_path, write_bytes
 from sejax.options import ConfigError
 from sejax.options.plain import differences
 
+DAMAGE = (EOFError, lzma.LZMAError, ValueError)  # what reading raises; pandas' are ValueErrors
 # Training steps grow along each curve: kept as differences, a table takes two thirds of the room.
 _GROWING, _DIFFERENCES = "steps", "steps_since_the_row_before"
 
@@ -48,7 +49,6 @@ class Shards:
         Raises:
           ConfigError: if the shard of that name was made with other settings.
         """
-        self.made_with[name] = settings
         (table,) = self.compute_all({name: settings}, lambda _: [compute()])
         return table
 
@@ -59,46 +59,42 @@ class Shards:
     ) -> list[pd.DataFrame]:
         """As `compute` for several shards, of which `compute(names)` makes all that are missing."""
         settings = json.loads(json.dumps(settings, default=str))
-        found = {name: self._read(name, mine) for name, mine in settings.items()}
-        missing = [name for name, table in found.items() if table is None]
+        self.made_with |= settings
+        tables = {name: self._read(name, mine) for name, mine in settings.items()}
+        missing = [name for name, table in tables.items() if table is None]
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
-            text = table.to_csv(index=False)
-            header = {"sha256": _digest(settings[name], text), "settings": settings[name]}
-            write_text(self.folder / f"{name}.csv", f"{json.dumps(header)}\n{text}")
-            found[name] = pd.read_csv(io.StringIO(text))  # as it will be read again
-        return [table for table in found.values() if table is not None]
+            text = f"{json.dumps(settings[name])}\n{table.to_csv(index=False)}"
+            write_bytes(self.path(name), lzma.compress(text.encode(), preset=1))
+            tables[name] = self._read(name, settings[name])  # as it will be read again
+        return [table for table in tables.values() if table is not None]
+
+    def path(self, name: str) -> Path:
+        """Where a shard is kept."""
+        return self.folder / f"{name}.csv.xz"
 
     def _read(self, name: str, settings: dict[str, Any]) -> pd.DataFrame | None:
         """A shard that was made with these settings; None if it is missing or damaged."""
-        path = self.folder / f"{name}.csv"
-        if not path.exists():
-            return None
+        path = self.path(name)
         try:
-            header, _, text = path.read_text(encoding="utf-8").partition("\n")
-            stored = json.loads(header)
-            is_whole = stored["sha256"] == _digest(stored["settings"], text)
-        except (ValueError, TypeError, KeyError):
-            is_whole = False
-        if not is_whole:
+            made_with, _, text = lzma.decompress(path.read_bytes()).partition(b"\n")
+            differing = differences(json.loads(made_with), settings, most=3)
+            table = pd.read_csv(io.BytesIO(text))
+        except FileNotFoundError:
+            return None
+        except DAMAGE:
             print(f"{path} is damaged: it is computed again.", flush=True)
             return None
-        differing = differences(stored["settings"], settings, most=3)
         if differing:
             raise ConfigError(
                 f"work must be a new folder or that of the same experiment; {path} differs in "
                 f"{differing}. Set work=DIR.",
                 "work",
             )
-        return pd.read_csv(io.StringIO(text))
-
-
-def _digest(settings: Any, text: str) -> str:
-    content = json.dumps(settings, sort_keys=True) + "\n" + text
-    return hashlib.sha256(content.encode()).hexdigest()
+        return table
 
 
 def write_rows(path: Path, rows: pd.DataFrame) -> None:
-    """Writes the rows of an experiment, compressed; xz keeps a checksum."""
+    """Writes the rows of an experiment."""
     if _GROWING in rows and pd.api.types.is_integer_dtype(rows[_GROWING]):
         differences = np.diff(rows[_GROWING], prepend=0)  # over the whole table, not by curve
         rows = rows.assign(**{_GROWING: differences}).rename(columns={_GROWING: _DIFFERENCES})
@@ -119,7 +115,7 @@ def read_rows(path: Path) -> pd.DataFrame:
             f"from_rows needs stored rows; there is no {path}. Set from_rows=false, or out=DIR.",
             "from_rows",
         ) from error
-    except (EOFError, lzma.LZMAError, ValueError) as error:  # pandas' errors are ValueErrors
+    except DAMAGE as error:
         raise ConfigError(
             f"from_rows needs whole rows; {path} is damaged ({' '.join(str(error).split())[:80]}). "
             "Restore the file, or set from_rows=false to make it again.",

@@ -7,10 +7,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.experiment import Settings
-from experiments.common.statistics import (
-    LEAST,
-    mean_interval,
-)
+from experiments.common.statistics import LEAST, mean_interval
 from sejax.ops.files import write_text
 
 
@@ -51,6 +48,11 @@ WORST_NOTE = " Worst tenth: the mean of the lowest tenth of what the mean is ove
 def brackets(low: float, high: float, digits: int) -> str:
     """An interval as it stands behind a mean; empty if there is none."""
     return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
+
+
+def known_text(value: float, form: str) -> str:
+    """A number in this format; empty if it is not known or inf."""
+    return format(value, form) if np.isfinite(value) else ""
 
 
 def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
