@@ -501,7 +501,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])
 def test_what_has_no_picture_says_so(env):
-    with pytest.raises(NotImplementedError, match="no picture"):
+    with pytest.raises(NotImplementedError):
         env.render()
 
 

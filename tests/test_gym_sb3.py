@@ -67,17 +67,17 @@ def test_lanes_are_single_environments(name):
 
 
 @needs_sb3
-def test_lanes_share_their_attributes():
+def test_lanes_have_their_own_attributes_and_step_together():
     envs = sejax.gym.make_sb3("cartpole", 3)
     assert envs.get_attr("render_mode") == [None] * 3 and not envs.has_attr("nothing")
     assert [x.horizon for x in envs.get_attr("config", indices=[0, 2])] == [1, 1]
     envs.set_attr("tag", 7)
-    assert envs.get_attr("tag", 1) == [7]
-    with pytest.raises(NotImplementedError, match="indices=None"):
-        envs.set_attr("tag", 7, indices=[1])
+    envs.set_attr("tag", 8, indices=[1])
+    assert envs.get_attr("tag") == [7, 8, 7]
     assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
-    with pytest.raises(NotImplementedError, match="reset together"):
-        envs.env_method("reset")
+    for method in ("reset", "step"):
+        with pytest.raises(NotImplementedError, match=f"{method} together"):
+            envs.env_method(method)
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     envs.close()
 

@@ -10,7 +10,7 @@ from support import paper_se, random_like, refused
 
 from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.gym.networks import shapes_of
-from sejax.gym.vector import PREFETCHED
+from sejax.gym.synthetic import PREFETCHED
 
 TASKS = {"cartpole": RealTask.of_gymnasium("CartPole-v1", 4),
          "pendulum": RealTask.of_gymnasium("Pendulum-v1", 3)}  # fmt: skip
