@@ -264,7 +264,7 @@ def test_what_does_not_fit_is_one_message():
     assert refused(make, "cartpole-rn", task) == "task"
     assert refused(make, "cartpole", render_mode="human") == "render_mode"
     assert make("cartpole", render_mode="rgb_array")  # as Stable-Baselines3's make_vec_env asks
-    for discount in (float("nan"), 3):
+    for discount in (float("nan"), 3, "x"):
         assert refused(RewardNetwork, cartpole, "cartpole-rn", discount) == "discount"
     assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500
 

@@ -32,13 +32,9 @@ def forward(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
 
 def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     activate = ACTIVATIONS[activation]
-    *hidden, (last_kernel, last_bias) = layers
-    for kernel, bias in hidden:
-        x = x @ kernel
+    for i, (kernel, bias) in enumerate(layers):
+        x = (activate(x) if i else x) @ kernel
         x += bias
-        x = activate(x)
-    x = x @ last_kernel
-    x += last_bias
     return x
 
 

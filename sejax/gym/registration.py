@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
-from sejax.gym.tasks import RealTask, rn_env, se_task
+from sejax.gym.tasks import Env, RealTask, rn_env, se_task
 from sejax.options import ConfigError, as_python, counts, registry, require, shortened
 from sejax.proxies.header import Header, pretrained_names, read
 
@@ -23,7 +23,7 @@ Source = str | Path
 
 def make(
     source: Source, task: RealTask | str | None = None, *, render_mode: str | None = None
-) -> gymnasium.Env[Any, Any]:
+) -> Env:
     """Makes a stored proxy a Gymnasium environment: an SE, or the real task with an RN's reward.
 
     Args:

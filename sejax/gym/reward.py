@@ -15,7 +15,7 @@ from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
 
 from sejax.gym import networks
-from sejax.gym.tasks import GYMNASIUM_IDS, Info, RealTask, space_of
+from sejax.gym.tasks import GYMNASIUM_IDS, Env, Info, RealTask, space_of
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
@@ -63,7 +63,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: Env,
         source: str | Path,
         discount: float | None = None,
         info_keys: Sequence[str] | None = None,
@@ -75,8 +75,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
-        self.discount = float(as_python(header.discount if discount is None else discount))
-        fraction()("discount", self.discount, header.discount)
+        discount = as_python(header.discount if discount is None else discount)
+        fraction()("discount", discount, header.discount)
+        self.discount = float(discount)
         self.limit_is_terminal = limit_is_terminal
         self._info_keys = self._keys(header.task, info_keys)
         num_inputs = space_of(env.observation_space, "env.observation_space").size
@@ -169,7 +170,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return tuple(keys if given else [GYMNASIUM_NAMES.get(key, key) for key in keys])
 
 
-def _require_task(env: gymnasium.Env[Any, Any], header: Header) -> None:
+def _require_task(env: Env, header: Header) -> None:
     """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
     layers = [env]  # the innermost last
     while isinstance(layers[-1], gymnasium.Wrapper):

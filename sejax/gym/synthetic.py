@@ -150,10 +150,12 @@ class SyntheticWorld:
             discount = discount * (1 - at_limit)
         return Step(outputs[..., :-2], reward, terminated, truncated, discount)
 
-    def observe(self, vector: np.ndarray) -> np.ndarray:
+    def observe(self, vector: np.ndarray) -> Any:
         """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
-        is_index = isinstance(self.observation_space, spaces.Discrete)
-        return np.argmax(vector, axis=-1) if is_index else vector.copy()
+        if isinstance(self.observation_space, spaces.Box):
+            return vector.copy()
+        index = np.argmax(vector, axis=-1)
+        return index if index.ndim else int(index)
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d; in a bandit the state stays, and d is 1."""
@@ -213,7 +215,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._time = 0
         self._vector = self.world.first(self.world.draw(self.np_random, 1)[0])
-        return self._observe(self._vector), {}
+        return self.world.observe(self._vector), {}
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step.
@@ -232,15 +234,11 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         terminated, truncated = bool(step.terminated), bool(step.truncated)
         self._vector = None if terminated or truncated else step.vector
         info = {"discount": float(step.discount)}
-        return self._observe(step.vector), float(step.reward), terminated, truncated, info
+        return self.world.observe(step.vector), float(step.reward), terminated, truncated, info
 
     def render(self) -> NoReturn:
         """Raises `NotImplementedError`: the states of an SE have no picture."""
         raise NotImplementedError("an SE's states have no picture: render its real task")
-
-    def _observe(self, vector: np.ndarray) -> Any:
-        obs = self.world.observe(vector)
-        return obs if obs.ndim else int(obs)
 
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
@@ -259,10 +257,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """
 
     def __init__(
-        self,
-        world: SyntheticWorld,
-        num_envs: int,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        self, world: SyntheticWorld, num_envs: int, autoreset_mode: AutoresetMode | str = "NextStep"
     ):
         self.world = world
         self.num_envs = num_envs

@@ -36,6 +36,7 @@ GYMNASIUM_IDS = {
 }
 GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
 
+Env = gymnasium.Env[Any, Any]
 Info = dict[str, Any]  # of a reset or a step; and what a reset is told
 Starts = Callable[[np.random.Generator], Any]
 
@@ -78,7 +79,7 @@ class RealTask:
         return cls(observation_space=observations, action_space=actions, max_steps=spec.max_steps)
 
     @classmethod
-    def of_env(cls, env: gymnasium.Env[Any, Any]) -> "RealTask":
+    def of_env(cls, env: Env) -> "RealTask":
         """A task given as an environment with Gymnasium's `TimeLimit` around it.
 
         Raises:
@@ -94,13 +95,13 @@ class RealTask:
         )
 
 
-def _first_observation(env: gymnasium.Env[Any, Any], rng: np.random.Generator) -> Any:
+def _first_observation(env: Env, rng: np.random.Generator) -> Any:
     """That of an environment's episode, as its wrappers show it."""
     env.unwrapped.np_random = rng
     return env.reset()[0]
 
 
-def make_gymnasium(env_id: str, **options: Any) -> gymnasium.Env[Any, Any]:
+def make_gymnasium(env_id: str, **options: Any) -> Env:
     """An environment of Gymnasium's registry.
 
     Args:
@@ -117,7 +118,7 @@ def make_gymnasium(env_id: str, **options: Any) -> gymnasium.Env[Any, Any]:
         raise ConfigError(message, "task") from error
 
 
-def real_env(header: Header, fix: str, **options: Any) -> gymnasium.Env[Any, Any]:
+def real_env(header: Header, fix: str, **options: Any) -> Env:
     """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same.
 
     Args:
@@ -158,38 +159,30 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
       ConfigError: if it must be given, or the one given has other actions or another step limit
         than the file's.
     """
-    learned = RealTask.of_spec(header.spec)
+    learned, limit = RealTask.of_spec(header.spec), header.spec.max_steps
+    if task is None and not config.needs_task:
+        return learned
+    # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
+    gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
+    if task is None and gymnax_id in gymnasium.registry:
+        task = gymnax_id
     if task is None:
-        if not config.needs_task:
-            return learned
-        # Where episodes begin in Gymnasium's task of that id, whatever gymnax's steps are.
-        gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
-        fix = "sejax.gym.make(source, task=sejax.gym.RealTask(...))"
-        is_there = gymnax_id in gymnasium.registry
-        task = gymnax_id if is_there else RealTask.of_env(real_env(header, fix))
+        task = RealTask.of_env(real_env(header, "task=sejax.gym.RealTask(...)"))
     if isinstance(task, str):
-        task = RealTask.of_gymnasium(task, learned.max_steps)
-    fix = "Set task=sejax.gym.RealTask.of_env(env)."
-    got = f"got {shortened(task)}. {fix}"
+        task = RealTask.of_gymnasium(task, limit)
+    got = f"got {shortened(task)}. Set task=sejax.gym.RealTask.of_env(env)."
     require(isinstance(task, RealTask), "task", f"must be a RealTask or an id of Gymnasium; {got}")
-    require(
-        is_same_space(space_of(task.action_space, "task.action_space"), header.spec.action),
-        "task",
-        f"must have the actions of the SE's task, {shortened(learned.action_space)}; got "
-        f"{shortened(task.action_space)}. gymnasium.wrappers.RescaleAction makes such.",
-    )
-    require(
-        config.max_steps(task.max_steps) == config.max_steps(learned.max_steps),
-        "task",
-        f"must have the step limit {learned.max_steps} of the SE's task; got "
-        f"{shortened(task.max_steps)}. Set max_steps={learned.max_steps}.",
-    )
+    actions, wanted = task.action_space, learned.action_space
+    has_actions = is_same_space(space_of(actions, "task.action_space"), header.spec.action)
+    got = f"got {shortened(actions)}. gymnasium.wrappers.RescaleAction makes such."
+    require(has_actions, "task", f"must have the actions of the SE's task, {wanted}; {got}")
+    has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
+    got = f"got {task.max_steps}. Set max_steps={limit}."
+    require(has_limit, "task", f"must have the step limit {limit} of the SE's task; {got}")
     return task
 
 
-def rn_env(
-    header: Header, env_id: RealTask | str | None, render_mode: str | None
-) -> gymnasium.Env[Any, Any]:
+def rn_env(header: Header, env_id: RealTask | str | None, render_mode: str | None) -> Env:
     """The task of an RN: one that is given by its id, or the file's.
 
     Raises:
