@@ -70,10 +70,8 @@ def stored_rn(tmp_path):
 
 
 def phi(weights, *inputs):
-    layers = {"Dense_0": {}, "Dense_1": {}}
-    for name, x in weights.items():
-        _, layer, part = name.split("/")
-        layers[layer][part] = x
+    parts = ("kernel", "bias")
+    layers = {x: {k: weights[f"potential/{x}/{k}"] for k in parts} for x in ("Dense_0", "Dense_1")}
     return numpy_forward(layers, np.concatenate(inputs), "prelu", 1)[0]
 
 

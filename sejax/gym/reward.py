@@ -91,8 +91,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
-        if isinstance(env.observation_space, Discrete):
-            self._table = [self.potential(one_hot) for one_hot in np.eye(num_inputs)]
+        if isinstance(env.observation_space, Discrete) and self._layers:
+            self._table = self._apply(np.eye(num_inputs)).tolist()
         self._potential = 0.0  # of the state that the agent is in
         self._made_as: EnvSpec | None = None
 
@@ -126,10 +126,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             return self._table[obs]
         if not self._layers:
             return 0.0
-        inputs = np.concatenate([obs, told]) if len(told) else obs
+        return float(self._apply(np.concatenate([obs, told]) if len(told) else obs))
+
+    def _apply(self, inputs: np.ndarray) -> np.ndarray:
         x = np.asarray(inputs, np.float32)
         outputs = networks.forward(self._layers, self.config.activation, x)
-        return self.config.output_scale * outputs.item()
+        return self.config.output_scale * outputs[..., 0]
 
     @property
     def spec(self) -> EnvSpec | None:
