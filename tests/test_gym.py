@@ -1,4 +1,4 @@
-"""sejax.gym: the same SEs as in JAX, as Gymnasium environments that need none of it."""
+"""sejax.gym: the same SEs as in JAX, alone and side by side, as Gymnasium environments."""
 
 import dataclasses
 import pickle
@@ -11,25 +11,27 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TransformObservation
 from support import paper_se, printed, random_like, refused, shapes_of
 
-import sejax
+import sejax.gym
 from sejax import envs
-from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
-from sejax.gym.networks import shapes_of as shapes_of_networks
+from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import find, pretrained_names
+from sejax.proxies.header import find, is_same_space, pretrained_names
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
 BANDIT = {"initial_state": "learned", "horizon": 1, "done": "threshold"}
+ALONE_AND_MANY = pytest.mark.parametrize("num_envs", [None, 3])
 
 
 def jax_se(task="cartpole", **config):
-    return registry.make("proxy", paper_se(**SMALL | config), envs.make(task))
+    task = envs.make(task) if isinstance(task, str) else task
+    return registry.make("proxy", paper_se(**SMALL | config), task)
 
 
 def random_weights(env, seed=0, scale=0.5):
@@ -48,16 +50,26 @@ def stored(tmp_path):
     return write
 
 
-def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
-    """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
+def world_of(task="cartpole", max_steps=4, outputs=None, **config):
+    """An SE of random weights, or of constant outputs, whatever it sees."""
+    task = RealTask.of_gymnasium(sejax.gym.GYMNASIUM_IDS[task], max_steps)
     config = paper_se(**SMALL | {"done": "threshold"} | config)
-    shapes = shapes_of_networks(config.networks(obs_dim=4, action_dim=2))
-    weights = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
-    for head, value in {"state": state, "reward": reward, "done": d}.items():
-        if f"{head}/Dense_1/bias" in weights:
-            weights[f"{head}/Dense_1/bias"][:] = value
-    task = RealTask.of_gymnasium("CartPole-v1", max_steps)
-    return SyntheticEnv(SyntheticWorld(weights, config, task))
+    units = config.networks(*map(spaces.flatdim, (task.observation_space, task.action_space)))
+    like = {k: np.zeros(shape) for k, shape in sejax.gym.networks.shapes_of(units).items()}
+    weights = random_like(like, seed=1, scale=0.0 if outputs else 0.5)
+    for head, value in (outputs or {}).items():
+        weights[f"{head}/Dense_1/bias"][:] = value
+    return SyntheticWorld(weights, config, task)
+
+
+def env_of(world, num_envs=None):
+    """One environment of an SE, or several side by side, which nothing resets."""
+    return SyntheticVectorEnv(world, num_envs, "Disabled") if num_envs else SyntheticEnv(world)
+
+
+def an_env(stored, source):
+    """Of the name of a shipped proxy, or of an SE's task and configuration."""
+    return make(source if isinstance(source, str) else stored(jax_se(source[0], **source[1])))
 
 
 # --- the same as in JAX --------------------------------------------------------------------------
@@ -69,66 +81,57 @@ def assert_close(got, expected):
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=max(1e-5, 1e-6 * largest))
 
 
-def assert_equal_steps(env, jax_env, params, num_steps=40):
-    """Compares all that both say of steps from the same states; returns how many episodes ended."""
-    step = jax.jit(jax_env.step_env)
-    empty = jax.eval_shape(jax_env.reset_env, KEY, params)[1]
-    is_horizon = jax_env.config.horizon is not None and jax_env.config.horizon_is_terminal
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    num_ended, time = 0, 0
-    for i in range(num_steps):
-        state = empty.replace(vector=jnp.asarray(env._vector), time=jnp.int32(time))
-        action = env.action_space.sample()
-        out = step(jax.random.key(i), state, jnp.asarray(action), params)
-        expected_obs, state, expected_reward, expected_terminated, expected_info = out
-        obs, reward, terminated, truncated, info = env.step(action)
-        assert type(reward) is type(info["discount"]) is float
-        assert type(terminated) is type(truncated) is bool
-        assert_close(obs, expected_obs)
-        assert_close(reward, expected_reward)
-        assert_close(info["discount"], expected_info["discount"])
-        assert terminated == expected_terminated
-        # At a horizon that terminates gymnax's step says that it truncates too.
-        assert truncated == (bool(jax_env.is_truncated(state, params)) and not is_horizon)
-        time += 1
-        if terminated or truncated:
-            num_ended, time = num_ended + 1, 0
-            env.reset()
-    return num_ended
+STEPPED = [
+    ("cartpole", {"done": "soft"}),
+    ("acrobot", {"done": "threshold", "num_layers": 2, "activation": "prelu"}),
+    ("gridworld_2x2", {"done": "threshold", "activation": "relu", "state_units": "bounds"}),
+    ("mountain_car", {"done": "threshold", "state_units": "bounds", "initial_state": "learned"}),
+    ("cartpole", {"done": "threshold", "state_units": "bounds", "horizon": 2}),
+    ("pendulum", {"done": "threshold", "state_units": "bounds", "horizon": 1}),
+    ("cartpole", {"done": "threshold", "activation": "fast_tanh", "horizon": 3}),
+    ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
+    ("cartpole", {"done": "sigmoid", "horizon": 3}),
+    ("mountain_car_continuous", {"done": "threshold", "horizon": 3, "horizon_is_terminal": False}),
+    ("cartpole", BANDIT),
+    ("gridworld_2x2", {"done": "soft", "horizon": 1}),
+    ("pendulum", {"done": "threshold", "state_units": "bounds", "initial_state": "noise"}),
+    ("cartpole", {"done": "soft", "min_steps": 3}),
+    ("cartpole", {"done": "sigmoid", "min_steps": 4, "horizon": 6}),
+]
 
 
-@pytest.mark.parametrize(
-    ("task", "config"),
-    [
-        ("cartpole", {"done": "soft"}),
-        ("acrobot", {"done": "threshold", "num_layers": 2, "activation": "prelu"}),
-        ("gridworld_2x2", {"done": "threshold", "activation": "relu", "state_units": "bounds"}),
-        ("mountain_car", {"done": "threshold", "state_units": "bounds",
-                          "initial_state": "learned"}),
-        ("cartpole", {"done": "threshold", "state_units": "bounds", "horizon": 2}),
-        ("pendulum", {"done": "threshold", "state_units": "bounds", "horizon": 1}),
-        ("cartpole", {"done": "threshold", "activation": "fast_tanh", "horizon": 3}),
-        ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
-        ("cartpole", {"done": "sigmoid", "horizon": 3}),
-        ("mountain_car_continuous", {"done": "threshold", "horizon": 3,
-                                     "horizon_is_terminal": False}),
-        ("cartpole", BANDIT),
-        ("gridworld_2x2", {"done": "soft", "horizon": 1}),
-        ("pendulum", {"done": "threshold", "state_units": "bounds", "initial_state": "noise"}),
-        ("cartpole", {"done": "soft", "min_steps": 3}),
-        ("cartpole", {"done": "sigmoid", "min_steps": 4, "horizon": 6}),
-    ],
-    ids=str,
-)  # fmt: skip
+@pytest.mark.parametrize(("task", "config"), STEPPED, ids=str)
 def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
+    """All that both say of steps from the same states."""
     jax_env = jax_se(task, **config)
     weights = random_weights(jax_env, scale=1.0)
     if config["done"] in ("bernoulli", "sigmoid"):  # far out, where any draw says the same
         last = weights["done"]["Dense_1"]
         last["kernel"], last["bias"] = 1e3 * last["kernel"], 1e3 * last["bias"]
-    env = make(stored(jax_env, weights))
-    assert assert_equal_steps(env, jax_env, jax_env.params(weights)) > 0
+    env, params = make(stored(jax_env, weights)), jax_env.params(weights)
+    step = jax.jit(jax_env.step_env)
+    empty = jax.eval_shape(jax_env.reset_env, KEY, params)[1]
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    num_ended = 0
+    for i in range(40):
+        state = empty.replace(vector=jnp.asarray(env._vector), time=jnp.int32(env._time))
+        action = env.action_space.sample()
+        expected = step(jax.random.key(i), state, jnp.asarray(action), params)
+        obs, reward, terminated, truncated, info = env.step(action)
+        kinds = [type(x) for x in (reward, terminated, truncated, info["discount"])]
+        assert kinds == [float, bool, bool, float]
+        assert_close(obs, expected[0])
+        assert_close(reward, expected[2])
+        assert_close(info["discount"], expected[4]["discount"])
+        assert terminated == expected[3]
+        # At a horizon that terminates gymnax's step says that it truncates too.
+        is_cut = bool(jax_env.is_truncated(expected[1], params))
+        assert truncated == (is_cut and not jax_env.config.ends_at_horizon)
+        if terminated or truncated:
+            num_ended += 1
+            env.reset()
+    assert num_ended > 0
 
 
 @pytest.mark.parametrize("scale", [0.5, 1e4], ids=["usual", "beyond what is absurd"])
@@ -137,13 +140,8 @@ def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale
     weights = random_weights(jax_env, scale=scale)
     env = make(stored(jax_env, weights))
     expected, _ = jax_env.reset_env(KEY, jax_env.params(weights))
-
-    class SameNoise(np.random.Generator):
-        def standard_normal(self, *_):
-            return np.asarray(jax.random.normal(KEY, (4,)))[None]
-
-    env.np_random = SameNoise(np.random.PCG64(0))
-    np.testing.assert_allclose(env.reset()[0], expected, rtol=1e-5, atol=1e-5)
+    noise = np.asarray(jax.random.normal(KEY, (4,)))
+    np.testing.assert_allclose(env.world.first(noise), expected, rtol=1e-5, atol=1e-5)
     assert (np.abs(expected).max() == MAX_ABS_VALUE) == (scale > 1)
 
 
@@ -157,6 +155,83 @@ def test_noise_of_initial_states_is_standard_normal(stored, initial_state):
     np.testing.assert_allclose(np.cov(noise.T), np.eye(4), atol=5 * (2 / 2000) ** 0.5)
 
 
+# --- side by side --------------------------------------------------------------------------------
+
+MODES = ["NextStep", "SameStep", "Disabled"]
+SES = {
+    "bandit": {"horizon": 1, "initial_state": "learned"},
+    "longer than a block of starts": {"horizon": 2, "initial_state": "noise"},
+    "cut": {"horizon": 3, "horizon_is_terminal": False, "initial_state": "learned"},
+    "drawn ends": {"done": "bernoulli", "initial_state": "learned"},
+    "real starts and drawn ends": {"done": "sigmoid"},
+    "soft": {"done": "soft"},
+    "of a least length": {"done": "soft", "min_steps": 2},
+    "continuous actions": {"task": "pendulum", "max_steps": 3, "state_units": "bounds"},
+}
+
+
+def listed(tree):
+    """A tree whose arrays of objects, which final observations are, are lists."""
+    return jax.tree.map(lambda x: x.tolist() if np.asarray(x).dtype.kind == "O" else x, tree)
+
+
+def assert_same(got, expected, tolerance=1e-5):
+    """Of what two environments return, nested infos and final observations included."""
+    got, expected = listed(got), listed(expected)
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    for a, b in zip(*map(jax.tree.leaves, (got, expected)), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype and np.shape(a) == np.shape(b)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", SES)
+def test_lanes_are_single_environments(name, mode):
+    world, num_envs = world_of(**SES[name]), 3
+    lanes = SyntheticVectorEnv(world, num_envs, mode)
+    singles = SyncVectorEnv([lambda: SyntheticEnv(world)] * num_envs, autoreset_mode=mode)
+    assert lanes.metadata == singles.metadata | {"autoreset_mode": AutoresetMode(mode)}
+    assert lanes.observation_space == singles.observation_space
+    assert lanes.action_space == singles.action_space
+    lanes.action_space.seed(0)
+    assert_same(lanes.reset(seed=5), singles.reset(seed=5))
+    num_ended = 0
+    for i in range(sejax.gym.synthetic.PREFETCHED + 4):
+        actions = lanes.action_space.sample()
+        is_discrete = actions.ndim == 1  # bools are such actions too, and no masks
+        given = actions.astype(bool) if is_discrete and i % 2 else actions
+        got, expected = lanes.step(given), singles.step(actions)
+        assert_same(got, expected)
+        ended = got[2] | got[3]
+        num_ended += ended.sum()
+        if mode == "Disabled" and ended.any():
+            given = {"reset_mask": ended}
+            assert_same(lanes.reset(options=given), singles.reset(options={**given}))
+    assert num_ended > num_envs
+    assert_same(lanes.reset(), singles.reset())
+    assert_same(lanes.reset(seed=[7, None, 9]), singles.reset(seed=[7, None, 9]))
+    assert lanes.np_random_seed == [7, 6, 9] and len(lanes.np_random) == num_envs
+
+
+def test_gymnasium_makes_the_shipped_ones_by_their_names():
+    own = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.SAME_STEP}
+    for name, options in (("sejax/cartpole", {}), ("sejax.gym:sejax/cartpole", own)):
+        made = gymnasium.make_vec(name, num_envs=3, **options)
+        assert isinstance(made, SyntheticVectorEnv) and made.spec.id == "sejax/cartpole"
+        obs, _ = made.reset(seed=4)
+        assert obs.shape == (3, 4)  # products of other shapes round otherwise on some machines
+        np.testing.assert_allclose(obs[0], make("cartpole").reset(seed=4)[0], rtol=0, atol=1e-6)
+    synced = gymnasium.make_vec("sejax/cartpole", num_envs=2, vectorization_mode="sync")
+    np.testing.assert_allclose(synced.reset(seed=4)[0], obs[:2], atol=1e-6)
+
+
+def test_vector_environments_take_a_render_mode_as_single_ones_do():
+    assert gymnasium.make_vec("sejax/cartpole", num_envs=np.int64(2), render_mode="rgb_array")
+    assert make_vec("cartpole", 2.0).num_envs == 2
+    of_rn = make_vec("mountain_car_continuous-rn", render_mode="rgb_array")
+    assert of_rn.envs[0].render_mode == "rgb_array"
+
+
 # --- ends ----------------------------------------------------------------------------------------
 
 
@@ -165,53 +240,49 @@ def test_noise_of_initial_states_is_standard_normal(stored, initial_state):
     [("bernoulli", 0.3, 0.3), ("sigmoid", -1.0, 1 / (1 + np.e)), ("sigmoid", 2.0, 0.8808)],
 )
 def test_ends_are_drawn_with_their_probability(mode, d, probability):
-    env = constant(d=d, done=mode)
-    env.reset(seed=0)
     count = 2000
-    ended = 0
-    for _ in range(count):
-        ended += env.step(0)[2]
-        env.reset()
-    assert abs(ended / count - probability) < 5 * (probability * (1 - probability) / count) ** 0.5
-
-
-def episode(env):
-    """Ends of all steps of an episode."""
-    env.reset(seed=0)
-    steps = []
-    while not steps or not any(steps[-1][:2]):
-        _, _, terminated, truncated, info = env.step(1)
-        steps.append((terminated, truncated, info["discount"]))
-    return steps
-
-
-def test_an_episode_is_truncated_at_the_tasks_limit():
-    assert episode(constant()) == [(False, False, 1.0)] * 199 + [(False, True, 1.0)]
-
-
-def test_an_episode_that_ends_at_its_limit_is_both_terminated_and_truncated():
-    assert episode(constant(d=1.0, max_steps=1)) == [(True, True, 0.0)]  # as with TimeLimit
+    lanes = env_of(world_of(outputs={"done": d}, done=mode), count)
+    lanes.reset(seed=0)
+    share = lanes.step(np.zeros(count, int))[2].mean()
+    assert abs(share - probability) < 5 * (probability * (1 - probability) / count) ** 0.5
 
 
 @pytest.mark.parametrize(
+    ("max_steps", "d", "last"),
+    [(200, 0.0, (False, True, 1.0)), (1, 1.0, (True, True, 0.0))],  # the second as with TimeLimit
+)
+def test_an_episode_is_truncated_at_the_tasks_limit(max_steps, d, last):
+    env = env_of(world_of(max_steps=max_steps, outputs={"done": d}))
+    env.reset(seed=0)
+    steps = [env.step(1) for _ in range(max_steps)]
+    told = [
+        (terminated, truncated, info["discount"]) for _, _, terminated, truncated, info in steps
+    ]
+    assert told == [(False, False, 1.0)] * (max_steps - 1) + [last]
+
+
+@ALONE_AND_MANY
+@pytest.mark.parametrize(
     "outputs",
-    [{"state": np.inf}, {"reward": np.nan}, {"d": -np.inf}, {"state": 2e6}, {"reward": -2e6}],
+    [{"state": np.inf}, {"reward": np.nan}, {"done": -np.inf}, {"state": 2e6}, {"reward": -2e6}],
     ids=str,
 )
 @pytest.mark.parametrize(("mode", "min_steps"), [("soft", 1), ("soft", 2), ("bernoulli", 1)])
-def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, min_steps, outputs):
-    finite = {name: x if np.isfinite(x) else 0.0 for name, x in outputs.items()}
-    env = constant(**finite, done=mode, min_steps=min_steps)
-    _, last_bias = env.world._layers[-1]
-    last_bias += [*[outputs.get("state", 0.0)] * 4, outputs.get("reward", 0), outputs.get("d", 0)]
+def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(
+    mode, min_steps, outputs, num_envs
+):
+    world = world_of(done=mode, min_steps=min_steps, outputs={"reward": 2.0})
+    _, last_bias = world._layers[-1]
+    last_bias += [*[outputs.get("state", 0)] * 4, outputs.get("reward", 0), outputs.get("done", 0)]
+    env = env_of(world, num_envs)
     first, _ = env.reset(seed=0)
-    obs, reward, terminated, _, info = env.step(0)
-    assert (obs == first).all() and reward == 0.0 and terminated is True
-    assert info["discount"] == 0.0
+    obs, reward, terminated, _, info = env.step(np.zeros(env.action_space.shape, int))
+    assert (obs == first).all() and np.all(reward == 0.0) and np.all(terminated)
+    assert np.all(info["discount"] == 0.0)
 
 
 def test_an_overflow_within_the_networks_ends_the_episode_without_a_warning():
-    env = constant()
+    env = env_of(world_of(outputs={"done": 0.0}))
     for kernel, _ in env.world._layers:
         kernel[:] = 3e38
     env.reset(seed=0)
@@ -220,13 +291,12 @@ def test_an_overflow_within_the_networks_ends_the_episode_without_a_warning():
 
 # --- as a Gymnasium environment ------------------------------------------------------------------
 
-CHECKED = [("cartpole", {"done": "threshold"}), ("cartpole", BANDIT),
-           ("pendulum", {"done": "bernoulli"}), ("gridworld_2x2", {"done": "sigmoid"})]  # fmt: skip
-
-
-def an_env(stored, source):
-    """Of the name of a shipped proxy, or of an SE's task and configuration."""
-    return make(source if isinstance(source, str) else stored(jax_se(source[0], **source[1])))
+CHECKED = [
+    ("cartpole", {"done": "threshold"}),
+    ("cartpole", BANDIT),
+    ("pendulum", {"done": "bernoulli"}),
+    ("gridworld_2x2", {"done": "sigmoid"}),
+]
 
 
 @pytest.mark.parametrize("source", [*CHECKED, *pretrained_names()], ids=str)
@@ -252,8 +322,7 @@ def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
 
 
 def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks(stored):
-    real = gymnasium.make("CartPole-v1")
-    path = stored(jax_se())
+    real, path = gymnasium.make("CartPole-v1"), stored(jax_se())
     env = make(path)
 
     def play(seed):
@@ -269,59 +338,73 @@ def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks(stored):
     assert not np.allclose(make(path).reset()[0], make(path).reset()[0])
 
 
-@pytest.mark.parametrize("source", [*CHECKED, "cartpole-rn"], ids=str)
+@pytest.mark.parametrize("source", [*CHECKED, "cartpole-rn", "side by side"], ids=str)
 def test_a_pickled_environment_goes_on_as_it_would_have(stored, source):
-    env = an_env(stored, source)
+    lanes = SyntheticVectorEnv(world_of(**SES["bandit"]), 2)
+    env = lanes if source == "side by side" else an_env(stored, source)
     env.reset(seed=0)
     copy = pickle.loads(pickle.dumps(env))
     env.action_space.seed(0)
     for _ in range(5):
         action = env.action_space.sample()
-        (obs, *rest), (same_obs, *same_rest) = env.step(action), copy.step(action)
-        np.testing.assert_array_equal(obs, same_obs)
-        assert rest == same_rest
-        np.testing.assert_array_equal(env.reset()[0], copy.reset()[0])
+        assert_same(copy.step(action), env.step(action), tolerance=0)
+        assert_same(copy.reset(), env.reset(), tolerance=0)
+
+
+@ALONE_AND_MANY
+def test_what_is_returned_is_the_callers(num_envs):
+    env = env_of(world_of(done="soft", min_steps=9, max_steps=9), num_envs)
+    actions = np.zeros(env.action_space.shape, int)
+    env.reset(seed=0)[0][:] = np.nan
+    env.step(actions)[0][:] = np.nan
+    assert np.isfinite(env.step(actions)[0]).all()
 
 
 def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
-    path = stored(jax_se())
-    env = make(path)
-    again = gymnasium.make(env.spec)
-    assert again.unwrapped.config == env.config
+    env = make(stored(jax_se()))
+    assert gymnasium.make(env.spec).unwrapped.config == env.config
     assert env.spec.id == "sejax/cartpole" and env.spec.max_episode_steps is None
-    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert gymnasium.make(type(env.spec).from_json(env.spec.to_json()))
 
 
 @pytest.mark.parametrize("name", ["by hand", "a(b)/c", "@"])
 def test_a_task_may_be_called_what_gymnasium_would_not(stored, name):
     task = dataclasses.replace(envs.make("cartpole"), name=name, origin=None)
-    env = make(stored(registry.make("proxy", paper_se(**SMALL, **BANDIT), task)))
+    env = make(stored(jax_se(task, **BANDIT)))
     assert gymnasium.make(env.spec).reset(seed=0)[0].shape == (4,)
 
 
-def test_a_step_needs_an_episode_and_an_action_of_the_space(stored):
-    env = constant(d=1.0)
+@pytest.mark.parametrize(
+    ("task", "num_envs", "good", "bad", "space"),
+    [
+        ("cartpole", None, True, [-1, 2, 0.5, None], r"Discrete\(2\)"),
+        ("cartpole", 2, [0, 1], [[0, 2], [0, -1], [0], 0, [0.0, 1.0], [[0, 1]]], "MultiDiscrete"),
+        ("pendulum", None, [7.0], [0.5], "Box"),
+        ("pendulum", 2, [[0.0], [7.0]], [[0.0, 1.0]], "Box"),
+    ],
+)
+def test_a_step_needs_an_episode_and_an_action_of_the_space(task, num_envs, good, bad, space):
+    env = env_of(world_of(task, outputs={"done": 1.0}), num_envs)
     with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(0)
+        env.step(good)
     env.reset(seed=0)
-    for action in (-1, 2, 0.5, None):
-        with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Discrete\(2\)"):
+    for action in bad:
+        with pytest.raises(gymnasium.error.InvalidAction, match=f"is none of {space}"):
             env.step(action)
-    assert env.step(True)[2]  # and np.int64(1)
+    assert np.all(env.step(good)[2])
+    if num_envs:  # one of those that have ended is not enough
+        env.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(0)
-    env = make(stored(jax_se("pendulum")))
-    env.reset(seed=0)
-    with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Box"):
-        env.step(0.5)
+        env.step(good)
 
 
-def test_continuous_actions_are_clipped_to_the_bounds(stored):
-    env = make(stored(jax_se("pendulum")))
+@ALONE_AND_MANY
+def test_continuous_actions_are_clipped_to_the_bounds(num_envs):
+    env = env_of(world_of("pendulum"), num_envs)
     seen = []
     for action in (2.0, 7.0, -2.0):
         env.reset(seed=0)
-        seen.append(env.step([action])[0])
+        seen.append(env.step(np.full(env.action_space.shape, action))[0])
     assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
 
 
@@ -335,8 +418,7 @@ def test_what_ships_is_registered_once_and_by_its_name():
     np.testing.assert_array_equal(env.reset(seed=1)[0], make("cartpole").reset(seed=1)[0])
 
 
-def test_it_starts_no_backend_of_jax_and_runs_in_forked_processes():
-    program = """
+NO_BACKEND = """
 import sys
 import sejax
 sejax.pretrained()
@@ -354,29 +436,50 @@ from jax._src import xla_bridge
 print(envs.step([0, 1])[0].shape, sorted(loaded), xla_bridge.backends_are_initialized())
 envs.close()
 """
-    assert printed(sys.executable, "-c", program) == "(2, 4) [] False\n"
+IN_NEW_PROCESSES = """
+import gymnasium
+
+def make():
+    return gymnasium.make("sejax.gym:sejax/cartpole")
+
+if __name__ == "__main__":
+    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="CONTEXT")
+    print(envs.reset(seed=0)[0].shape, gymnasium.spec("sejax/cartpole").id)
+    envs.close()
+"""
+
+
+def test_it_starts_no_backend_of_jax_and_runs_in_forked_processes():
+    assert printed(sys.executable, "-c", NO_BACKEND) == "(2, 4) [] False\n"
+
+
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_ids_that_name_the_package_are_known_in_new_processes(context):
+    """In a fresh process, as the test's own has what its processes would need to import."""
+    program = IN_NEW_PROCESSES.replace("CONTEXT", context)
+    assert printed(sys.executable, "-c", program) == "(2, 4) sejax/cartpole\n"
+
+
+@pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])
+def test_what_has_no_picture_says_so(env):
+    with pytest.raises(NotImplementedError):
+        env.render()
 
 
 # --- tasks ---------------------------------------------------------------------------------------
 
 
 # Gymnasium's MuJoCo environments need imageio: see test_mujoco.py.
-@pytest.mark.parametrize("name", sorted(x for x in GYMNASIUM_IDS if "-v5" not in GYMNASIUM_IDS[x]))
+@pytest.mark.parametrize("name", [k for k, x in sejax.gym.GYMNASIUM_IDS.items() if "-v5" not in x])
 def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
-    task, real = envs.make(name), RealTask.of_gymnasium(GYMNASIUM_IDS[name])
+    task, real = envs.make(name), RealTask.of_gymnasium(sejax.gym.GYMNASIUM_IDS[name])
     assert real.observation_space.shape == (task.obs_dim,)
-    if task.num_actions is None:
-        assert real.action_space.shape == (task.action_dim,)
-        assert np.allclose(real.action_space.high, task.max_action)
-        assert np.allclose(real.action_space.low, -task.max_action)
-    else:
-        assert real.action_space == spaces.Discrete(task.num_actions)
+    assert is_same_space(sejax.gym.tasks.space_of(real.action_space, "task"), task.action)
 
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
 def test_a_task_of_gymnax_is_gymnasiums_of_that_id(stored, given, limit):
-    jax_env = paper_se(**SMALL).make(envs.make("gymnax/MountainCar-v0", **given))
-    env = make(stored(jax_env))
+    env = make(stored(jax_se(envs.make("gymnax/MountainCar-v0", **given))))
     assert env.action_space == spaces.Discrete(3) and env.world.max_steps == limit
     (position, velocity), _ = env.reset(seed=0)
     assert -0.6 <= position <= -0.4 and velocity == 0.0
@@ -389,8 +492,7 @@ def a_start(rng):
 def test_an_unknown_task_must_be_given(stored):
     from gymnax.environments.classic_control import pendulum
 
-    task = sejax.Task(name="mine", env=pendulum.Pendulum(), max_steps=7)
-    path = stored(registry.make("proxy", paper_se(**SMALL, done="bernoulli"), task))
+    path = stored(jax_se(sejax.Task(name="mine", env=pendulum.Pendulum(), max_steps=7)))
     box = spaces.Box(-2, 2, (1,))
     mine = RealTask(observation_space=spaces.Box(-8, 8, (3,)), action_space=box, max_steps=7)
     assert refused(make, path) == "task"
@@ -409,23 +511,36 @@ def test_an_unknown_task_must_be_given(stored):
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
     task = dataclasses.replace(envs.make("pendulum"), name="mine", origin=None)
-    config = paper_se(**SMALL, initial_state="learned", state_units="bounds")
-    path = stored(registry.make("proxy", config, task))
+    path = stored(jax_se(task, initial_state="learned", state_units="bounds"))
     env, given = make(path), make(path, "Pendulum-v1")
-    assert (env.action_space, env.observation_space) == (given.action_space, spaces.Box(
-        -np.inf, np.inf, (3,)))  # fmt: skip
-    for each in (env, given):
-        each.reset(seed=0)
-    action = np.array([0.5], np.float32)
+    assert env.action_space == given.action_space
+    assert env.observation_space == spaces.Box(-np.inf, np.inf, (3,))
+    assert_same(env.reset(seed=0), given.reset(seed=0), tolerance=0)
     for _ in range(3):
-        here, there = env.step(action), given.step(action)
-        np.testing.assert_array_equal(here[0], there[0])
-        assert here[1:4] == there[1:4]
+        assert_same(env.step([0.5]), given.step([0.5]), tolerance=0)
     monkeypatch.setattr(gymnasium, "make", None)
     assert make("halfcheetah").action_space == spaces.Box(-1, 1, (6,))
 
 
-def test_what_is_no_single_se_is_one_message(tmp_path, stored):
+def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
+    path, task = stored(jax_se()), RealTask.of_gymnasium("CartPole-v1")
+    assert refused(make, path, task) == "task"
+    for given in (None, "CartPole-v1", dataclasses.replace(task, max_steps=200)):
+        assert make(path, given).world.max_steps == 200
+    assert make(stored(jax_se(horizon=1)), task).world.max_steps == 1  # whatever the task's
+
+
+def test_starts_are_as_the_environments_wrappers_show_them(stored):
+    real = gymnasium.make("CartPole-v1", max_episode_steps=200)
+    wrapped = TransformObservation(real, lambda obs: 10 * obs, real.observation_space)
+    se = make(stored(jax_se()), RealTask.of_env(wrapped))
+    np.testing.assert_array_equal(se.reset(seed=0)[0], wrapped.reset(seed=0)[0])
+
+
+# --- what cannot be ------------------------------------------------------------------------------
+
+
+def test_what_is_no_single_se_is_one_message(tmp_path):
     env = jax_se()
     other, several = tmp_path / "other.safetensors", tmp_path / "set.safetensors"
     sejax.save(other, env, random_weights(env), config={"proxy": {"name": "mine:LinearSE"}})
@@ -435,11 +550,15 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
 
 
 @pytest.mark.parametrize(
-    "name, given",
-    [("halfcheetah-rn", {"xml_file": "/etc/hostname"}), ("cartpole-rn", {"render_mode": "human"}),
-     ("cartpole-rn", {"sutton_barto_reward": True}), ("cliff_walking-rn", {"goal_reward": "x"}),
-     ("cliff_walking-rn", {"bogus": 1})],
-)  # fmt: skip
+    ("name", "given"),
+    [
+        ("halfcheetah-rn", {"xml_file": "/etc/hostname"}),
+        ("cartpole-rn", {"render_mode": "human"}),
+        ("cartpole-rn", {"sutton_barto_reward": True}),
+        ("cliff_walking-rn", {"goal_reward": "x"}),
+        ("cliff_walking-rn", {"bogus": 1}),
+    ],
+)
 def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_path, name, given):
     tensors, header = unpack(find(name).read_bytes(), "sejax")
     header["config"]["env"] |= given
@@ -455,55 +574,24 @@ def test_weights_that_are_not_the_networks_are_refused_as_in_jax(tmp_path):
     assert refused(make, path) == "weights"
 
 
-def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    env = registry.make("proxy", paper_se(**SMALL), envs.make("cartpole"))
-    path = stored(env)
-    assert make(path).world.max_steps == make(path, "CartPole-v1").world.max_steps == 200
-    task = RealTask.of_gymnasium("CartPole-v1")
-    assert refused(make, path, task) == "task"
-    assert make(path, dataclasses.replace(task, max_steps=200)).world.max_steps == 200
-    bandit = stored(registry.make("proxy", paper_se(**SMALL, horizon=1),
-                                 envs.make("cartpole")))  # fmt: skip
-    assert make(bandit, task).world.max_steps == 1  # whatever the task's
+@pytest.mark.parametrize(
+    ("field", "options"),
+    [
+        ("num_envs", {"num_envs": 0}),
+        ("num_envs", {"num_envs": 2.5}),
+        ("autoreset_mode", {"autoreset_mode": "samestep"}),
+        ("render_mode", {"render_mode": "human"}),
+    ],
+)
+def test_an_option_that_cannot_be_is_one_message(field, options):
+    assert refused(make_vec, "cartpole", **options) == field
 
 
-def test_starts_are_as_the_environments_wrappers_show_them(stored):
-    path = stored(registry.make("proxy", paper_se(**SMALL), envs.make("cartpole")))
-    real = gymnasium.make("CartPole-v1", max_episode_steps=200)
-    wrapped = TransformObservation(real, lambda obs: 10 * obs, real.observation_space)
-    se = make(path, RealTask.of_env(wrapped))
-    np.testing.assert_array_equal(se.reset(seed=0)[0], wrapped.reset(seed=0)[0])
-
-
-def test_vector_environments_take_a_render_mode_as_single_ones_do():
-    assert gymnasium.make_vec("sejax/cartpole", num_envs=np.int64(2), render_mode="rgb_array")
-    assert sejax.gym.make_vec("cartpole", 2.0).num_envs == 2
-    assert refused(sejax.gym.make_vec, "cartpole", 2, render_mode="human") == "render_mode"
-    envs_of_rn = sejax.gym.make_vec("mountain_car_continuous-rn", 1, render_mode="rgb_array")
-    assert envs_of_rn.envs[0].render_mode == "rgb_array"
-
-
-@pytest.mark.parametrize("context", ["spawn", "forkserver"])
-def test_ids_that_name_the_package_are_known_in_new_processes(context):
-    """In a fresh process, as the test's own has what its processes would need to import."""
-    program = f"""
-import gymnasium
-
-def make():
-    return gymnasium.make("sejax.gym:sejax/cartpole")
-
-if __name__ == "__main__":
-    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="{context}")
-    print(envs.reset(seed=0)[0].shape, gymnasium.spec("sejax/cartpole").id)
-    envs.close()
-"""
-    assert printed(sys.executable, "-c", program) == "(2, 4) sejax/cartpole\n"
-
-
-@pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])
-def test_what_has_no_picture_says_so(env):
-    with pytest.raises(NotImplementedError, match="no picture"):
-        env.render()
+def test_seeds_and_masks_have_the_length_of_the_lanes():
+    lanes = SyntheticVectorEnv(world_of(), 2)
+    assert refused(lanes.reset, seed=[1, 2, 3]) == "seed"
+    for mask in (np.array([True]), np.array([1, 0])):
+        assert refused(lanes.reset, options={"reset_mask": mask}) == "options.reset_mask"
 
 
 def test_a_proxy_is_found_from_home(tmp_path, monkeypatch):

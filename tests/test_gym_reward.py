@@ -5,22 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium.wrappers import (
-    DtypeObservation,
-    FlattenObservation,
-    NormalizeObservation,
-    RescaleAction,
-    TimeLimit,
-    TransformAction,
-    TransformObservation,
-    TransformReward,
-)  # fmt: skip
+from gymnasium import wrappers
 from support import numpy_forward, random_like, refused, shapes_of
 
 import sejax
 from sejax import envs
-from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
-from sejax.gym import GridWorld, RewardNetwork, make, networks
+from sejax.gym import GridWorld, RewardNetwork, make, make_vec, networks
 from sejax.options import registry
 from sejax.proxies import header
 from sejax.proxies.reward import VARIANTS, RewardConfig, RewardState
@@ -49,44 +39,39 @@ class Walk(gymnasium.Env):
     def step(self, action):
         self.place += float(action[0])
         self.num_steps += 1
-        info = {"x_position": self.place, "x_velocity": float(action[0]), "reward_forward": 3.0,
-                "reward_ctrl": -1.0}  # fmt: skip
+        info = {"x_position": self.place, "x_velocity": float(action[0])}
+        info |= {"reward_forward": 3.0, "reward_ctrl": -1.0}
         return self._see(), np.float64(self.reward), self.num_steps >= self.length, False, info
 
 
-WALK = {"observation": {"low": [None] * 2, "high": [None] * 2},
-        "action": {"low": [-1.0], "high": [1.0]}, "max_steps": 1000}  # fmt: skip
+ENDLESS = {"low": [None] * 2, "high": [None] * 2}
+WALK = {"observation": ENDLESS, "action": {"low": [-1.0], "high": [1.0]}, "max_steps": 1000}
 
 
-def stored_rn(tmp_path, num_inputs, task="walk", discount=0.9, interface=WALK, **config):
-    """An RN's file of random weights, written by hand; and the weights."""
-    config = RewardConfig(hidden_size=5, **config)
-    shapes = networks.shapes_of({"potential": [num_inputs, 5, 1]})
-    if config.shaping.weighs_info:
-        shapes = {"info_weights": (num_inputs,)}
-    tensors = random_like({name: np.zeros(shape) for name, shape in shapes.items()}, 2, 0.5)
-    stored = header.Header(
-        format_version=header.FORMAT_VERSION, task=task, interface=interface, discount=discount,
-        config={"env": {"name": task}, "proxy": {"name": "rn", **vars(config)}}, is_set=False,
-        proxies=[{}],
-    )  # fmt: skip
-    path = tmp_path / "rn.safetensors"
-    path.write_bytes(header.packed(tensors, stored))
-    if config.shaping.weighs_info:
-        return path, tensors["info_weights"]
-    layers = {layer: {k: tensors[f"potential/{layer}/{k}"] for k in ("kernel", "bias")}
-              for layer in ("Dense_0", "Dense_1")}  # fmt: skip
-    return path, layers
+@pytest.fixture
+def stored_rn(tmp_path):
+    """Writes an RN of random weights by hand; returns its file and the weights."""
+
+    def write(num_inputs, task="walk", interface=WALK, **config):
+        config = RewardConfig(hidden_size=5, **config)
+        shapes = networks.shapes_of({"potential": [num_inputs, 5, 1]})
+        if config.shaping.weighs_info:
+            shapes = {"info_weights": (num_inputs,)}
+        tensors = random_like({name: np.zeros(shape) for name, shape in shapes.items()}, 2, 0.5)
+        config = {"env": {"name": task}, "proxy": {"name": "rn", **vars(config)}}
+        options = {"task": task, "interface": interface, "config": config, "discount": 0.9}
+        options |= {"format_version": header.FORMAT_VERSION, "is_set": False, "proxies": [{}]}
+        path = tmp_path / "rn.safetensors"
+        path.write_bytes(header.packed(tensors, header.Header(**options)))
+        return path, tensors
+
+    return write
 
 
 def phi(weights, *inputs):
-    return numpy_forward(weights, np.concatenate(inputs), "prelu", 1)[0]
-
-
-def expected_reward(variant, real, before, after, discount=0.9):
-    shaped = {"potential": discount * after - before, "non_potential": after}
-    additive, _, kind = variant.partition("_")
-    return shaped[kind] + (real if additive == "additive" else 0.0)
+    parts = ("kernel", "bias")
+    layers = {x: {k: weights[f"potential/{x}/{k}"] for k in parts} for x in ("Dense_0", "Dense_1")}
+    return numpy_forward(layers, np.concatenate(inputs), "prelu", 1)[0]
 
 
 # --- rewards -------------------------------------------------------------------------------------
@@ -94,49 +79,45 @@ def expected_reward(variant, real, before, after, discount=0.9):
 
 @pytest.mark.parametrize("variant", NETWORKS)
 @pytest.mark.parametrize(
-    ("zero_at_terminal", "output_scale"), [(False, 1.0), (True, 1.0), (False, 0.1)]
+    ("zero_at_terminal", "output_scale", "discount"),
+    [(False, 1.0, None), (True, 1.0, 0.99), (False, 0.1, None)],  # None: that of the RN's agent
 )
 def test_every_variant_pays_what_its_equation_says(
-    tmp_path, variant, zero_at_terminal, output_scale
+    stored_rn, variant, zero_at_terminal, output_scale, discount
 ):
     options = {"zero_at_terminal": zero_at_terminal, "output_scale": output_scale}
-    path, weights = stored_rn(tmp_path, 2, variant=variant, **options)
-    env = RewardNetwork(Walk(length=2), path)
+    path, weights = stored_rn(2, variant=variant, **options)
+    env = RewardNetwork(Walk(length=2), path, discount=discount)
     obs, _ = env.reset(seed=0)
     for action in ([0.5], [-0.25]):
         before = output_scale * phi(weights, obs)
         obs, reward, terminated, truncated, info = env.step(action)
         after = 0.0 if terminated and zero_at_terminal else output_scale * phi(weights, obs)
-        assert reward == pytest.approx(expected_reward(variant, 0.5, before, after), abs=1e-5)
+        additive, _, kind = variant.partition("_")
+        shaped = {"potential": (discount or 0.9) * after - before, "non_potential": after}[kind]
+        expected = shaped + (0.5 if additive == "additive" else 0.0)
+        assert reward == pytest.approx(expected, abs=1e-5)
         assert info["real_reward"] == 0.5 and info["discount"] == 1.0 - terminated
         assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
     assert terminated
 
 
 @pytest.mark.parametrize("limit_is_terminal", [False, True])
-def test_the_step_limit_is_an_end_for_whom_it_is_one(tmp_path, limit_is_terminal):
-    path, weights = stored_rn(tmp_path, 2, variant="exclusive_non_potential", zero_at_terminal=True)
-    env = RewardNetwork(TimeLimit(Walk(), 1), path, limit_is_terminal=limit_is_terminal)
+def test_the_step_limit_is_an_end_for_whom_it_is_one(stored_rn, limit_is_terminal):
+    path, weights = stored_rn(2, variant="exclusive_non_potential", zero_at_terminal=True)
+    env = wrappers.TimeLimit(Walk(), 1)
+    env = RewardNetwork(env, path, limit_is_terminal=limit_is_terminal)
     env.reset()
     obs, reward, terminated, truncated, _ = env.step([0.5])
     assert truncated and not terminated
     assert reward == pytest.approx(0.0 if limit_is_terminal else phi(weights, obs), abs=1e-6)
 
 
-def test_a_potential_has_the_discount_of_the_agent_that_trains(tmp_path):
-    path, weights = stored_rn(tmp_path, 2, discount=0.7, variant="exclusive_potential")
-    for given, gamma in ((None, 0.7), (0.99, 0.99)):
-        env = RewardNetwork(Walk(), path, discount=given)
-        before = phi(weights, env.reset()[0])
-        obs, reward, *_ = env.step([0.5])
-        assert reward == pytest.approx(gamma * phi(weights, obs) - before, abs=1e-5)
-
-
 @pytest.mark.parametrize("given", [None, ["x_position", "x_velocity"]])
-def test_an_augmented_network_sees_info_of_its_own_state(tmp_path, given):
+def test_an_augmented_network_sees_info_of_its_own_state(stored_rn, given):
     """Zeros before the first step, whatever `reset` tells, as in JAX."""
     task = "halfcheetah" if given is None else "mine"
-    path, weights = stored_rn(tmp_path, 4, task, variant="exclusive_potential", augmented=True)
+    path, weights = stored_rn(4, task, variant="exclusive_potential", augmented=True)
     env = RewardNetwork(Walk(), path, info_keys=given)
     obs, _ = env.reset()
     before = phi(weights, obs, [0, 0])
@@ -148,35 +129,35 @@ def test_an_augmented_network_sees_info_of_its_own_state(tmp_path, given):
 
 
 @pytest.mark.parametrize("variant", ["additive_weighted_info", "exclusive_weighted_info"])
-def test_weighted_info_is_a_product(tmp_path, variant):
-    path, weights = stored_rn(tmp_path, 4, "halfcheetah", variant=variant)
+def test_weighted_info_is_a_product(stored_rn, variant):
+    path, weights = stored_rn(4, "halfcheetah", variant=variant)
     env = RewardNetwork(Walk(), path)
     env.reset()
     _, reward, *_ = env.step([0.5])
-    expected = weights @ [0.75, 0.5, 3.0, -1.0] + (0.5 if variant.startswith("add") else 0.0)
+    expected = weights["info_weights"] @ [0.75, 0.5, 3.0, -1.0]
+    expected += 0.5 if variant.startswith("additive") else 0.0
     assert reward == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("real", [np.nan, np.inf])
-def test_an_absurd_reward_is_none_and_terminates(tmp_path, real):
-    path, _ = stored_rn(tmp_path, 2, variant="additive_potential")
-    env = RewardNetwork(Walk(reward=real), path)
+@pytest.mark.parametrize(
+    ("kind", "real", "learned", "expected"),
+    [
+        ("additive", np.nan, 1.0, None),
+        ("additive", np.inf, 1.0, None),
+        ("additive", 0.5, 1e9, None),
+        ("additive", -2e7, 1.0, -2e7),
+        ("exclusive", -2e7, 1.0, 1.0),
+    ],
+)
+def test_an_absurd_reward_is_none_and_terminates(stored_rn, kind, real, learned, expected):
+    """A real one of money's size passes, and a learned one does not."""
+    env = RewardNetwork(Walk(real), stored_rn(2, variant=f"{kind}_non_potential")[0])
     env.reset()
+    env.potential = lambda *_: learned
     _, reward, terminated, _, info = env.step([0.5])
-    assert reward == 0.0 and terminated is True and info["discount"] == 0.0
-
-
-@pytest.mark.parametrize(("variant", "passes"), [("additive_potential", True),
-                                                 ("exclusive_potential", False)])  # fmt: skip
-def test_real_rewards_of_money_size_pass_and_learned_ones_do_not(tmp_path, variant, passes):
-    path, _ = stored_rn(tmp_path, 2, variant=variant)
-    env = RewardNetwork(Walk(reward=-2e7), path)
-    env.reset()
-    _, reward, terminated, _, info = env.step([0.5])
-    assert (reward == pytest.approx(-2e7, abs=10)) == passes and not terminated
-    assert info["real_reward"] == -2e7
-    env.potential = lambda *_: 1e9
-    assert env.step([0.5])[1:3] == (0.0, True)
+    assert reward == (pytest.approx(expected, abs=10) if expected else 0.0)
+    assert terminated is (expected is None) and info["discount"] == 1.0 - terminated
+    np.testing.assert_equal(info["real_reward"], real)
 
 
 @pytest.mark.slow
@@ -209,20 +190,19 @@ def test_rewards_are_those_of_the_rn_in_jax(name):
 # --- tasks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", CLIFF_WALKING),
-                                            ("gridworld_2x2", ROOM_2X2)])  # fmt: skip
-def test_grid_worlds_are_those_in_jax(name, rows):
+@pytest.mark.parametrize("name", ["cliff_walking", "gridworld_2x2"])
+def test_grid_worlds_are_those_in_jax(name):
     """Every step from every state, by the tables of the one in JAX, which has tests of its own."""
     task, env = envs.make(name), GridWorld(name)
     world, params = task.env, task.params
     assert env.reset(seed=0) == (world._start, {})
-    for state, action in np.ndindex(len("".join(rows)), 4):
+    for state, action in np.ndindex(task.num_states, 4):
         env._index = state
         obs, reward, terminated, truncated, _ = env.step(action)
         goal, hole = world._goal[obs], world._hole[obs]
         assert (obs, terminated, truncated) == (world._next[state, action], goal | hole, False)
-        assert reward == (params.goal_reward if goal else params.hole_reward if hole
-                          else params.step_reward)  # fmt: skip
+        at_end = params.goal_reward if goal else params.hole_reward
+        assert reward == (at_end if terminated else params.step_reward)
 
 
 def test_a_grid_world_needs_an_episode_and_one_of_four_actions():
@@ -249,22 +229,29 @@ def test_the_time_limit_is_the_tasks_and_there_once():
     assert [env.step(3)[3] for _ in range(50)] == [False] * 49 + [True]
 
 
-def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
+def test_the_spec_of_a_wrapper_makes_the_wrapper_again(stored_rn):
     cartpole = envs.make("cartpole").interface
-    path, _ = stored_rn(tmp_path, 4, interface=cartpole, variant="exclusive_potential")
+    path, _ = stored_rn(4, interface=cartpole, variant="exclusive_potential")
     env = RewardNetwork(gymnasium.make("CartPole-v1"), path, discount=0.5)
     again = gymnasium.make(type(env.spec).from_json(env.spec.to_json()))
     assert again.discount == 0.5 and again.spec.max_episode_steps == 500
-    both = [TransformReward(x, lambda r: 2 * r) for x in (env, again)]
+    both = [wrappers.TransformReward(x, lambda r: 2 * r) for x in (env, again)]
     for x in both:
         x.reset(seed=0)
     assert both[0].step(1)[1] == both[1].step(1)[1]
 
 
+def test_lanes_of_a_reward_network_are_gymnasiums():
+    lanes, single = make_vec("cartpole-rn", 2, autoreset_mode="SameStep"), make("cartpole-rn")
+    np.testing.assert_array_equal(lanes.reset(seed=3)[0][1], single.reset(seed=4)[0])
+    assert lanes.step([1, 1])[1][1] == single.step(1)[1]
+    assert lanes.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+
+
 # --- what cannot be ------------------------------------------------------------------------------
 
 
-def test_what_does_not_fit_is_one_message(tmp_path):
+def test_what_does_not_fit_is_one_message():
     cartpole = gymnasium.make("CartPole-v1")
     assert refused(RewardNetwork, cartpole, "cartpole") == "source"  # an SE
     assert refused(RewardNetwork, gymnasium.make("MountainCar-v0"), "cartpole-rn") == "env"
@@ -274,39 +261,36 @@ def test_what_does_not_fit_is_one_message(tmp_path):
     assert refused(make, "cartpole-rn", task) == "task"
     assert refused(make, "cartpole", render_mode="human") == "render_mode"
     assert make("cartpole", render_mode="rgb_array")  # as Stable-Baselines3's make_vec_env asks
-    for discount in (float("nan"), 3):
+    for discount in (float("nan"), 3, "x"):
         assert refused(RewardNetwork, cartpole, "cartpole-rn", discount) == "discount"
     assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500
 
 
 def test_the_network_sees_the_tasks_own_observations():
     cartpole = gymnasium.make("CartPole-v1")
-    normalized = TransformReward(NormalizeObservation(cartpole), float)
+    normalized = wrappers.TransformReward(wrappers.NormalizeObservation(cartpole), float)
     assert refused(RewardNetwork, normalized, "cartpole-rn") == "env"
-    assert NormalizeObservation(RewardNetwork(cartpole, "cartpole-rn")).reset(seed=0)
+    assert wrappers.NormalizeObservation(RewardNetwork(cartpole, "cartpole-rn")).reset(seed=0)
     pendulum = gymnasium.make("InvertedPendulum-v5")  # 4 numbers too, and other actions
     assert refused(RewardNetwork, pendulum, "cartpole-rn") == "env"
-    # Actions may be another agent's, and observations made what the network sees.
-    car = gymnasium.make("MountainCarContinuous-v0")
-    for env in (
-        RescaleAction(car, np.float32(-2), np.float32(2)),
-        FlattenObservation(InADict(car)),
-    ):
-        rewards = RewardNetwork(env, "mountain_car_continuous-rn")
-        rewards.reset(seed=0)
-        assert np.isfinite(rewards.step(np.array([0.5], np.float32))[1])
 
 
 def test_actions_may_be_made_and_numbers_kept_by_wrappers():
     car = gymnasium.make("MountainCarContinuous-v0")
-    for env in (DtypeObservation(car, np.float32), FlattenObservation(car), Hidden(car)):
-        assert RewardNetwork(env, "mountain_car_continuous-rn").reset(seed=0)
-    two = gymnasium.spaces.Discrete(2)
-    pushes = TransformAction(Walk(), lambda a: [a - 0.5], two)
-    assert RewardNetwork(TransformObservation(pushes, lambda x: np.tile(x, 2), FOUR), "cartpole-rn")
-
-
-FOUR = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    for env in (
+        wrappers.DtypeObservation(car, np.float32),
+        wrappers.FlattenObservation(car),
+        wrappers.FlattenObservation(InADict(car)),
+        wrappers.RescaleAction(car, np.float32(-2), np.float32(2)),
+        Hidden(car),
+    ):
+        rewards = RewardNetwork(env, "mountain_car_continuous-rn")
+        rewards.reset(seed=0)
+        assert np.isfinite(rewards.step(np.array([0.5], np.float32))[1])
+    pushes = wrappers.TransformAction(Walk(), lambda a: [a - 0.5], gymnasium.spaces.Discrete(2))
+    four = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    tiled = wrappers.TransformObservation(pushes, lambda x: np.tile(x, 2), four)
+    assert RewardNetwork(tiled, "cartpole-rn")
 
 
 class Hidden(gymnasium.Env):
@@ -320,6 +304,9 @@ class Hidden(gymnasium.Env):
 
     def reset(self, **options):
         return self._inner.reset(**options)
+
+    def step(self, action):
+        return self._inner.step(action)
 
 
 class InADict(gymnasium.Wrapper):
@@ -340,14 +327,13 @@ class InADict(gymnasium.Wrapper):
         return {"obs": obs}, *rest
 
 
-def test_info_that_is_not_there_is_one_message(tmp_path):
+def test_info_that_is_not_there_is_one_message(stored_rn):
     options = {"interface": envs.make("cartpole").interface, "variant": "exclusive_weighted_info"}
-    env = RewardNetwork(
-        gymnasium.make("CartPole-v1"), stored_rn(tmp_path, 4, "halfcheetah", **options)[0]
-    )
+    path, _ = stored_rn(4, "halfcheetah", **options)
+    env = RewardNetwork(gymnasium.make("CartPole-v1"), path)
     env.reset()
     assert refused(env.step, 0) == "env"
-    path, _ = stored_rn(tmp_path, 4, "mine", **options)
+    path, _ = stored_rn(4, "mine", **options)
     assert refused(RewardNetwork, gymnasium.make("CartPole-v1"), path) == "info_keys"
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import TransformObservation
-from test_gym_vector import SES, world_of
+from test_gym import SES, assert_same, world_of
 
 import sejax.gym
 from sejax.gym import SyntheticEnv
@@ -46,38 +46,31 @@ def test_lanes_are_single_environments(name):
     singles = DummyVecEnv([lambda: SyntheticEnv(world)] * num_envs)
     lanes.action_space.seed(0)
     assert lanes.seed(5) == singles.seed(5) == [5, 6, 7]
-    np.testing.assert_allclose(lanes.reset(), singles.reset(), atol=1e-5)
+    assert_same(lanes.reset(), singles.reset())
     num_ended = 0
     for _ in range(40):
         actions = np.stack([lanes.action_space.sample() for _ in range(num_envs)])
-        *got, infos = lanes.step(actions)
-        *expected, expected_infos = singles.step(actions)
-        for a, b in zip(got, expected, strict=True):
-            assert a.dtype == b.dtype and a.shape == b.shape
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
-        for a, b in zip(infos, expected_infos, strict=True):
-            assert a.keys() == b.keys() and a["TimeLimit.truncated"] is b["TimeLimit.truncated"]
-            for key in a:
-                np.testing.assert_allclose(a[key], b[key], rtol=1e-5, atol=1e-5)
+        got = lanes.step(actions)
+        assert_same(got, singles.step(actions))
         num_ended += got[2].sum()
     assert num_ended > num_envs
     copy = pickle.loads(pickle.dumps(lanes))
-    np.testing.assert_array_equal(lanes.step(actions)[0], copy.step(actions)[0])
-    np.testing.assert_array_equal(lanes.reset(), copy.reset())
+    assert_same(lanes.step(actions), copy.step(actions), tolerance=0)
+    assert_same(lanes.reset(), copy.reset(), tolerance=0)
 
 
 @needs_sb3
-def test_lanes_share_their_attributes():
+def test_lanes_have_their_own_attributes_and_step_together():
     envs = sejax.gym.make_sb3("cartpole", 3)
     assert envs.get_attr("render_mode") == [None] * 3 and not envs.has_attr("nothing")
     assert [x.horizon for x in envs.get_attr("config", indices=[0, 2])] == [1, 1]
     envs.set_attr("tag", 7)
-    assert envs.get_attr("tag", 1) == [7]
-    with pytest.raises(NotImplementedError, match="indices=None"):
-        envs.set_attr("tag", 7, indices=[1])
+    envs.set_attr("tag", 8, indices=[1])
+    assert envs.get_attr("tag") == [7, 8, 7]
     assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
-    with pytest.raises(NotImplementedError, match="reset together"):
-        envs.env_method("reset")
+    for method in ("reset", "step"):
+        with pytest.raises(NotImplementedError, match=f"{method} together"):
+            envs.env_method(method)
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     envs.close()
 

@@ -17,12 +17,10 @@ Example:
 
 import gymnasium
 
-from sejax.gym.gridworld import GridWorld
 from sejax.gym.registration import make, make_sb3, make_vec, register
 from sejax.gym.reward import RewardNetwork
-from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
-from sejax.gym.tasks import GYMNASIUM_IDS, RealTask
-from sejax.gym.vector import SyntheticVectorEnv
+from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
+from sejax.gym.tasks import GYMNASIUM_IDS, GridWorld, RealTask
 
 __all__ = [
     "GYMNASIUM_IDS",

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
-Shapes = dict[str, tuple[int, ...]]
 
 # Activations that are computed at once. Arrays of 96 KB stay in the cache, and below the size from
 # which C's allocator asks the system for fresh pages each time, which took ten times the product.
@@ -33,13 +32,9 @@ def forward(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
 
 def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     activate = ACTIVATIONS[activation]
-    *hidden, (last_kernel, last_bias) = layers
-    for kernel, bias in hidden:
-        x = x @ kernel
+    for i, (kernel, bias) in enumerate(layers):
+        x = (activate(x) if i else x) @ kernel
         x += bias
-        x = activate(x)
-    x = x @ last_kernel
-    x += last_bias
     return x
 
 
@@ -58,28 +53,27 @@ def joined(networks: Sequence[Layers]) -> Layers:
     whole: Layers = []
     for parts in zip(*networks, strict=True):
         kernels, biases = zip(*parts, strict=True)
-        blocks = [kernel.T for kernel in kernels]
-        kernel = (_block_diagonal(blocks) if whole else np.concatenate(blocks)).T
+        kernel = _block_diagonal(kernels) if whole else np.concatenate(kernels, axis=1)
         whole.append((kernel, np.concatenate(biases)))
     return whole
 
 
 def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    def at(i: int, j: int) -> np.ndarray:
-        return blocks[i] if i == j else np.zeros((len(blocks[i]), blocks[j].shape[1]), np.float32)
+    ends = np.cumsum([block.shape for block in blocks], axis=0)
+    whole = np.zeros(ends[-1], np.float32, order="F")
+    for block, (row, column) in zip(blocks, ends, strict=True):
+        whole[row - block.shape[0] : row, column - block.shape[1] : column] = block
+    return whole
 
-    places = range(len(blocks))
-    return np.block([[at(i, j) for j in places] for i in places])
 
-
-def shapes_of(networks: Mapping[str, Sequence[int]]) -> Shapes:
+def shapes_of(networks: Mapping[str, Sequence[int]]) -> dict[str, tuple[int, ...]]:
     """Shapes of networks' tensors in a file, by the numbers of inputs and of each layer's units.
 
     Example:
       >>> shapes_of({"reward": [6, 1]})
       {'reward/Dense_0/kernel': (1, 6), 'reward/Dense_0/bias': (1,)}
     """
-    shapes: Shapes = {}
+    shapes: dict[str, tuple[int, ...]] = {}
     for name, units in networks.items():
         for i, (num_inputs, num_outputs) in enumerate(itertools.pairwise(units)):
             shapes[f"{name}/Dense_{i}/kernel"] = (num_outputs, num_inputs)

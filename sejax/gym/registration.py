@@ -10,23 +10,20 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
-from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
-from sejax.gym.tasks import RealTask, rn_env, se_task
-from sejax.gym.vector import SyntheticVectorEnv
+from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
+from sejax.gym.tasks import Env, RealTask, rn_env, se_task
 from sejax.options import ConfigError, as_python, counts, registry, require, shortened
 from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-NAMESPACE = "sejax"  # of the ids
-
 Source = str | Path
 
 
 def make(
     source: Source, task: RealTask | str | None = None, *, render_mode: str | None = None
-) -> gymnasium.Env[Any, Any]:
+) -> Env:
     """Makes a stored proxy a Gymnasium environment: an SE, or the real task with an RN's reward.
 
     Args:
@@ -51,12 +48,11 @@ def make(
     header, world = _read(source, task, render_mode)
     name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
     env: SyntheticEnv | RewardNetwork
-    if world is None:
-        env, name = RewardNetwork(rn_env(header, task, render_mode), source), f"{name}-rn"
-    else:
+    if world:
         env = SyntheticEnv(world)
-    options = {"source": str(source), "task": task, "render_mode": render_mode}
-    env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
+    else:
+        env, name = RewardNetwork(rn_env(header, task, render_mode), source), f"{name}-rn"
+    env.spec = _spec(name, source=str(source), task=task, render_mode=render_mode)
     return env
 
 
@@ -117,10 +113,8 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
 
         from sejax.gym.sb3 import SyntheticVecEnv
     except ImportError as error:
-        raise ConfigError(
-            f"make_sb3 needs Stable-Baselines3; got {error}. Install it with pip install "
-            "'sejax[sb3]'."
-        ) from error
+        message = f"make_sb3 needs Stable-Baselines3; got {error}. Type pip install 'sejax[sb3]'."
+        raise ConfigError(message) from error
     _, world = _read(source, task)
     if world is None:
         return DummyVecEnv([partial(make, source, task)] * num_envs)
@@ -146,12 +140,8 @@ def register() -> list[str]:
 
 def _spec(name: str, **kwargs: Any) -> EnvSpec:
     """How Gymnasium makes it; with `max_episode_steps` it would add a second time limit."""
-    return EnvSpec(
-        id=f"{NAMESPACE}/{name}",
-        entry_point="sejax.gym:make",
-        vector_entry_point="sejax.gym:make_vec",
-        kwargs=kwargs,
-    )
+    entries: dict[str, Any] = {"vector_entry_point": "sejax.gym:make_vec", "kwargs": kwargs}
+    return EnvSpec(f"sejax/{name}", "sejax.gym:make", **entries)
 
 
 def _count(num_envs: float) -> int:
@@ -171,18 +161,8 @@ def _read(
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
-    require(
-        render_mode in (None, "rgb_array"),
-        "render_mode",
-        f"must be None, as an SE's states have no picture; got {shortened(render_mode)}.",
-    )
+    can_do = render_mode in (None, "rgb_array")
+    got = shortened(render_mode)
+    require(can_do, "render_mode", f"must be None, as an SE has no picture; got {got}.")
     config = registry.configure("proxy", header.config["proxy"])
-    given = se_task(header, task, config.needs_task)
-    limit = header.spec.max_steps
-    require(
-        config.max_steps(given.max_steps) == config.max_steps(limit),
-        "task",
-        f"must have the step limit {limit} of the SE's task; got {shortened(given.max_steps)}. Set "
-        f"task=dataclasses.replace(task, max_steps={limit}).",
-    )
-    return header, SyntheticWorld(weights, config, given)
+    return header, SyntheticWorld(weights, config, se_task(header, config, task))

@@ -1,24 +1,24 @@
 """Reward networks (RNs) in NumPy, around a Gymnasium environment of their task."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import ObservationWrapper
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.spaces import Box, Discrete, Space, flatdim
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
 
-from sejax.envs.spec import Discrete
 from sejax.gym import networks
-from sejax.gym.gridworld import Info
-from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, space_of
+from sejax.gym.tasks import GYMNASIUM_IDS, Env, Info, RealTask, space_of
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import check_tensors, read
+from sejax.proxies.header import Header, check_tensors, read
 from sejax.proxies.reward import RewardConfig
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
@@ -63,41 +63,36 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     def __init__(
         self,
-        env: gymnasium.Env[Any, Any],
+        env: Env,
         source: str | Path,
         discount: float | None = None,
         info_keys: Sequence[str] | None = None,
         limit_is_terminal: bool = False,
     ):
-        RecordConstructorArgs.__init__(
-            self,
-            source=str(source),
-            discount=discount,
-            info_keys=info_keys,
-            limit_is_terminal=limit_is_terminal,
-        )
+        options: Info = {"source": str(source), "discount": discount, "info_keys": info_keys}
+        options["limit_is_terminal"] = limit_is_terminal
+        RecordConstructorArgs.__init__(self, **options)
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
-        discount = as_python(discount)
-        if discount is not None:
-            fraction()("discount", discount, header.discount)
-        self.discount = float(header.discount if discount is None else discount)
+        discount = as_python(header.discount if discount is None else discount)
+        fraction()("discount", discount, header.discount)
+        self.discount = float(discount)
         self.limit_is_terminal = limit_is_terminal
         self._info_keys = self._keys(header.task, info_keys)
-        obs_space = space_of(env.observation_space, "env.observation_space")
-        _require_task(env, RealTask.of_spec(header.spec), header.task)
+        num_inputs = space_of(env.observation_space, "env.observation_space").size
+        _require_task(env, header)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
-        shapes: networks.Shapes = {"info_weights": (num_keys,)}
-        if not self.config.shaping.weighs_info:
-            shapes = networks.shapes_of({"potential": [obs_space.size + num_keys, *hidden, 1]})
+        shapes = networks.shapes_of({"potential": [num_inputs + num_keys, *hidden, 1]})
+        if self.config.shaping.weighs_info:
+            shapes = {"info_weights": (num_keys,)}
         check_tensors("weights", weights, shapes, "those of the environment's task")
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
-        if isinstance(obs_space, Discrete) and self._layers:
-            self._table = self._apply(np.eye(obs_space.n, dtype=np.float32)).tolist()
+        if isinstance(env.observation_space, Discrete) and self._layers:
+            self._table = self._apply(np.eye(num_inputs)).tolist()
         self._potential = 0.0  # of the state that the agent is in
         self._made_as: EnvSpec | None = None
 
@@ -131,8 +126,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             return self._table[obs]
         if not self._layers:
             return 0.0
-        vector = np.asarray(obs, np.float32)
-        return float(self._apply(np.concatenate([vector, told]) if len(told) else vector))
+        return float(self._apply(np.concatenate([obs, told]) if len(told) else obs))
+
+    def _apply(self, inputs: np.ndarray) -> np.ndarray:
+        x = np.asarray(inputs, np.float32)
+        outputs = networks.forward(self._layers, self.config.activation, x)
+        return self.config.output_scale * outputs[..., 0]
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -151,20 +150,13 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         after = 0.0 if ends and self.config.zero_at_terminal else self._potential
         return self.discount * after - before if self.config.shaping.is_potential_based else after
 
-    def _apply(self, inputs: np.ndarray) -> np.ndarray:
-        outputs = networks.forward(self._layers, self.config.activation, inputs)
-        return self.config.output_scale * outputs[..., 0]
-
     def _told(self, info: Info) -> np.ndarray:
         """The entries of a step's `info` that the RN weighs or sees, `[info_keys]`."""
-        try:
-            return np.array([info[key] for key in self._info_keys], np.float32)
-        except KeyError as error:
-            raise ConfigError(
-                f"env must tell {', '.join(self._info_keys)} in a step's info; got "
-                f"{', '.join(info) or 'none'}. Set RewardNetwork(..., info_keys=[...]).",
-                "env",
-            ) from error
+        missing = [key for key in self._info_keys if key not in info]
+        if missing:
+            fix = "Set RewardNetwork(..., info_keys=[...])."
+            raise ConfigError(f"env must tell {missing} in info; got {[*info]}. {fix}", "env")
+        return np.array([info[key] for key in self._info_keys], np.float32)
 
     def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
         """Entries of `info` that the RN needs."""
@@ -172,51 +164,38 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if not (weighs_info or self.config.augmented):
             return ()
         name = "info_keys" if weighs_info else "augmented_keys"
-        keys: Sequence[str] = given or ()
+        keys = given or ()
         if not given and task in GYMNASIUM_IDS:
-            spec = registry.configure("env", {"name": task}).spec
-            keys = [GYMNASIUM_NAMES.get(key, key) for key in getattr(spec, name)]
-        require(
-            keys,
-            "info_keys",
-            f"must be given for {shortened(task)}, whose info is not known here; got none. Set "
-            f"info_keys to `sejax.Task.{name}`.",
-        )
-        return tuple(keys)
+            keys = getattr(registry.configure("env", {"name": task}).spec, name)
+        got = f"{shortened(task)}, whose info is not known here"
+        require(keys, "info_keys", f"must be `sejax.Task.{name}`; got none for {got}.")
+        return tuple(keys if given else [GYMNASIUM_NAMES.get(key, key) for key in keys])
 
 
-def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:
+def _require_task(env: Env, header: Header) -> None:
     """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
-    layers = list(_layers(env))
+    layers = [env]  # the innermost last
+    while isinstance(layers[-1], gymnasium.Wrapper):
+        layers.append(layers[-1].env)
+    learned = RealTask.of_spec(header.spec)
     own, wanted = env.observation_space, learned.observation_space
     is_as_it_is = _kind(layers[-1].observation_space) == _kind(wanted)  # made so by no wrapper
-    odd = [
-        each
-        for each in layers
-        if isinstance(each, gymnasium.ObservationWrapper) and not isinstance(each, SAME_NUMBERS)
-    ]
+    changed = [x for x in layers if isinstance(x, ObservationWrapper)]
+    changed = [x for x in changed if is_as_it_is and not isinstance(x, SAME_NUMBERS)]
     # Wrappers may make actions of one kind of another: some layer has the task's.
     acts = {_kind(layer.action_space) for layer in layers}
-    checks = (
-        (not isinstance(env.unwrapped, CliffWalkingEnv), "sejax's actions and falls", env),
-        (_kind(own) == _kind(wanted), f"the observations {wanted}", own),
-        (acts & {_kind(learned.action_space), None}, "its actions", env.action_space),
-        (not (is_as_it_is and odd), "observations that no wrapper below has changed", odd[:1]),
-    )
-    for holds, must, got in checks:
-        require(holds, "env", f"must be of {shortened(name)}, with {must}; got {shortened(got)}.")
+    must = f"must be of {shortened(header.task)}, with"
+    is_other = isinstance(env.unwrapped, CliffWalkingEnv)
+    require(not is_other, "env", f"{must} sejax's actions and falls; got {shortened(env)}.")
+    is_seen = _kind(own) == _kind(wanted)
+    require(is_seen, "env", f"{must} the observations {wanted}; got {shortened(own)}.")
+    has_actions = acts & {_kind(learned.action_space), None}
+    require(has_actions, "env", f"{must} its actions; got {shortened(env.action_space)}.")
+    got = f"observations that no wrapper below has changed; got {shortened(changed[:1])}."
+    require(not changed, "env", f"{must} {got}")
 
 
-def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
-    """An environment and what it is wrapped around, the innermost last."""
-    yield env
-    while isinstance(env, gymnasium.Wrapper):
-        env = env.env
-        yield env
-
-
-def _kind(space: gymnasium.Space[Any]) -> tuple[str, int] | None:
+def _kind(space: Space[Any]) -> tuple[bool, int] | None:
     """What must be equal for two spaces to be of one task; None for one that is not known."""
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return "discrete", int(space.n)
-    return ("box", int(np.prod(space.shape))) if isinstance(space, gymnasium.spaces.Box) else None
+    is_known = isinstance(space, Box | Discrete)
+    return (isinstance(space, Box), flatdim(space)) if is_known else None

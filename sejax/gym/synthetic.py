@@ -1,22 +1,27 @@
 """Synthetic environments (SEs) in NumPy: the world that one is, and one episode in it at a time."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from sejax.envs.spec import Box
 from sejax.gym import networks
-from sejax.gym.gridworld import Info
-from sejax.gym.tasks import RealTask
-from sejax.options import require
+from sejax.gym.tasks import Info, RealTask, space_of
+from sejax.options import one_of, require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import check_tensors
 from sejax.proxies.synthetic import SyntheticConfig
+
+PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
 Numbers = np.ndarray | float
 
@@ -59,34 +64,29 @@ class SyntheticWorld:
         self.max_steps = config.max_steps(task.max_steps)
         self.draws_ends = config.done in ("bernoulli", "sigmoid") and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
-        spec = task.spec
-        self.obs_dim = spec.obs_dim
-        self._num_states, self._num_actions = spec.num_states, spec.num_actions
+        observation = space_of(task.observation_space, "task.observation_space")
+        action_dim = space_of(task.action_space, "task.action_space").size
+        self.obs_dim = observation.size
         self.observation_space, self._units = task.observation_space, None
-        if isinstance(spec.observation, Box):
-            self._units = config.units(spec.observation)
+        if isinstance(observation, Box):
+            self._units = config.units(observation)
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
-        units = config.networks(self.obs_dim, spec.action_dim)
+        units = config.networks(self.obs_dim, action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
         self._start_layers = networks.layers_of(weights, "start")
         heads = [networks.layers_of(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
-        self._starts = task.starts
-        require(
-            self.draws_noise or self._starts,
-            "task.starts",
-            "must be given for an SE whose initial states are the real task's; got None. Set "
-            "RealTask(starts=...).",
-        )
-        self._one_hot = np.eye(spec.action_dim, dtype=np.float32)
+        fix = "got None. Set RealTask(starts=...)."
+        require(self.draws_noise or task.starts, "task.starts", f"must draw initial states; {fix}")
+        self._starts: Any = task.starts  # not None if it is called
+        self._one_hot = np.eye(action_dim, dtype=np.float32)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """What the first states of `count` episodes are made of, `[count, obs_dim]` float32."""
         if self.draws_noise:
             return rng.standard_normal((count, self.obs_dim), np.float32)
-        assert self._starts is not None
         starts = [self._starts(rng) for _ in range(count)]
-        if self._num_states:
+        if isinstance(self.observation_space, spaces.Discrete):
             return np.eye(self.obs_dim, dtype=np.float32)[starts]
         return np.array(starts, np.float32)
 
@@ -111,14 +111,14 @@ class SyntheticWorld:
         Raises:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
-        if self._num_actions:
+        if isinstance(self.action_space, spaces.Discrete):
             array = np.asarray(action) if space.shape else action
             if space.contains(array):  # also of bools, which would be a mask
                 return self._one_hot[array.astype(np.intp) if space.shape else int(array)]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
-        raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
+        raise InvalidAction(f"{action!r} is none of {space}")
 
     def step(
         self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
@@ -135,9 +135,8 @@ class SyntheticWorld:
         absurd: Any = False
         if not np.abs(outputs).max() < MAX_ABS_VALUE:  # nan is not either
             absurd = ~(np.abs(outputs).max(axis=-1) < MAX_ABS_VALUE)
-            stays = np.zeros_like(outputs)  # where it was, without a reward
-            stays[..., :-2], stays[..., -1] = vector, 1
-            outputs = np.where(absurd[..., None], stays, outputs)
+            outputs[absurd, :-2] = vector[absurd]  # where it was, without a reward
+            outputs[absurd, -2:] = 0, 1
         reward, done = outputs[..., -2], outputs[..., -1]
         if outputs.ndim == 1:  # one at a time, Python's numbers are quicker than NumPy's
             reward, done = reward.item(), done.item()
@@ -151,9 +150,12 @@ class SyntheticWorld:
             discount = discount * (1 - at_limit)
         return Step(outputs[..., :-2], reward, terminated, truncated, discount)
 
-    def observe(self, vector: np.ndarray) -> np.ndarray:
+    def observe(self, vector: np.ndarray) -> Any:
         """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
-        return np.argmax(vector, axis=-1) if self._num_states else vector.copy()
+        if isinstance(self.observation_space, spaces.Box):
+            return vector.copy()
+        index = np.argmax(vector, axis=-1)
+        return index if index.ndim else int(index)
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d; in a bandit the state stays, and d is 1."""
@@ -200,8 +202,6 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
       world: of the SE.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium declares it)
-
     def __init__(self, world: SyntheticWorld):
         self.world = world
         self.config = world.config
@@ -215,7 +215,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         self._time = 0
         self._vector = self.world.first(self.world.draw(self.np_random, 1)[0])
-        return self._observe(self._vector), {}
+        return self.world.observe(self._vector), {}
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step.
@@ -226,7 +226,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
             are clipped to its bounds, as in Gymnasium's own environments.
         """
         if self._vector is None:
-            raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
+            raise ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(action, self.action_space)
         self._time += 1
         chance = self.np_random.random() if self.world.draws_ends else None
@@ -234,12 +234,131 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         terminated, truncated = bool(step.terminated), bool(step.truncated)
         self._vector = None if terminated or truncated else step.vector
         info = {"discount": float(step.discount)}
-        return self._observe(step.vector), float(step.reward), terminated, truncated, info
+        return self.world.observe(step.vector), float(step.reward), terminated, truncated, info
 
     def render(self) -> NoReturn:
         """Raises `NotImplementedError`: the states of an SE have no picture."""
         raise NotImplementedError("an SE's states have no picture: render its real task")
 
-    def _observe(self, vector: np.ndarray) -> Any:
-        obs = self.world.observe(vector)
-        return obs if obs.ndim else int(obs)
+
+class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
+    """Episodes of an SE as a Gymnasium vector environment.
+
+    Environment i equals `SyntheticEnv` after `reset(seed=seed + i)` up to rounding, whatever
+    happens in the others: each has a generator of its own, which draws its starts and ends. Infos,
+    and what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
+
+    Args:
+      world: of the SE.
+      num_envs: number of environments.
+      autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
+        SameStep (the end's step returns the next episode's first observation, and the last one's
+        own as `infos["final_obs"]`), or Disabled (`reset(options={"reset_mask": ended})`).
+    """
+
+    def __init__(
+        self, world: SyntheticWorld, num_envs: int, autoreset_mode: AutoresetMode | str = "NextStep"
+    ):
+        self.world = world
+        self.num_envs = num_envs
+        if not isinstance(autoreset_mode, AutoresetMode):
+            one_of([mode.value for mode in AutoresetMode])("autoreset_mode", autoreset_mode, None)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = world.observation_space
+        self.single_action_space = world.action_space
+        self.observation_space = batch_space(world.observation_space, num_envs)
+        self.action_space = batch_space(world.action_space, num_envs)
+        self._vectors = np.zeros((num_envs, world.obs_dim), np.float32)
+        self._times = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+        # Of each environment, as in Gymnasium's own; None before the first reset.
+        self._np_random: list[Any] = [None] * num_envs  # type: ignore[assignment]
+        self._np_random_seed: list[int | None] = [None] * num_envs  # type: ignore[assignment]
+        # A generator gives the same numbers one by one and all at once, which is quicker.
+        num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
+        self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
+        self._num_used = np.full(num_envs, num_drawn)  # of those
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Begins an episode in each environment.
+
+        Args:
+          seed: of the first environment, and the next ones have the numbers that follow; or a seed
+            for each.
+          options: `reset_mask`, `[num_envs]` of bool: only these environments.
+
+        Raises:
+          ConfigError: for seeds or a mask of another length.
+        """
+        n, seeds = self.num_envs, seed
+        if seeds is None or isinstance(seeds, int | np.integer):
+            seeds = [None if seeds is None else int(seeds) + i for i in range(n)]
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
+        is_mask, got = mask.shape == (n,) and mask.dtype == np.bool_, f"{mask.shape} {mask.dtype}"
+        require(len(seeds) == n, "seed", f"must be one number, or {n}; got {len(seeds)}.")
+        require(is_mask, "options.reset_mask", f"must be [{n}] of bool; got {got}.")
+        for i in np.flatnonzero(mask).tolist():
+            if self._np_random[i] is None or seeds[i] is not None:
+                self._np_random[i], self._np_random_seed[i] = seeding.np_random(seeds[i])
+                self._num_used[i] = self._drawn.shape[1]  # what it had drawn before is void
+        self._begin(mask)
+        return self.world.observe(self._vectors), {}
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """One step of each environment.
+
+        Raises:
+          gymnasium.error.ResetNeeded: if an environment has no episode that goes on.
+          gymnasium.error.InvalidAction: for actions that are none of the space's.
+        """
+        is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        if None in self._np_random or (self._ended.any() and not is_next_step):
+            raise ResetNeeded("call reset() first: no episode is running")
+        encoded = self.world.encode(actions, self.action_space)
+        on = ~self._ended  # the others begin an episode
+        rewards, discounts = np.zeros((2, self.num_envs))
+        terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
+        if on.any():
+            self._times += on
+            chances = None
+            if self.world.draws_ends:
+                chances = np.array([self._np_random[i].random() for i in np.flatnonzero(on)])
+            step = self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
+            self._vectors[on], rewards[on], discounts[on] = step.vector, step.reward, step.discount
+            terminated[on], truncated[on] = step.terminated, step.truncated
+        self._begin(self._ended)
+        self._ended = ended = terminated | truncated
+        infos: Info = _told(discounts, on)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            final_obs = np.full(self.num_envs, None)
+            obs = self.world.observe(self._vectors)
+            for i in np.flatnonzero(ended):
+                final_obs[i] = obs[i]
+            finals = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
+            masks = {"_final_obs": ended, "_final_info": ended}
+            infos = finals | masks | _told(discounts, ~ended)
+            self._begin(ended)
+        return self.world.observe(self._vectors), rewards, terminated, truncated, infos
+
+    def _begin(self, mask: np.ndarray) -> None:
+        """Puts environments at the beginning of an episode."""
+        indices, num_drawn = np.flatnonzero(mask), self._drawn.shape[1]
+        if not indices.size:
+            return
+        for i in indices[self._num_used[indices] == num_drawn]:
+            self._drawn[i] = self.world.draw(self._np_random[i], num_drawn)
+            self._num_used[i] = 0
+        self._vectors[indices] = self.world.first(self._drawn[indices, self._num_used[indices]])
+        self._num_used += mask
+        self._times *= ~mask
+        self._ended = self._ended & ~mask
+
+
+def _told(discounts: np.ndarray, mask: np.ndarray) -> Info:
+    """Discounts of some environments in Gymnasium's form of infos; empty if of none."""
+    return {"discount": np.where(mask, discounts, 0.0), "_discount": mask} if mask.any() else {}

@@ -1,19 +1,22 @@
 """The real tasks behind proxies, as Gymnasium has them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import TimeLimit
 
+from sejax.envs import gridworld
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
-from sejax.gym.gridworld import MAPS, GridWorld
 from sejax.options import ConfigError, registry, require, shortened, told
 from sejax.options.plain import to_plain
 from sejax.proxies.header import Header, is_same_space
+from sejax.proxies.synthetic import SyntheticConfig
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -32,8 +35,9 @@ GYMNASIUM_IDS = {
     "reacher": "Reacher-v5",
 }
 GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
-GYMNAX = "gymnax/"
 
+Env = gymnasium.Env[Any, Any]
+Info = dict[str, Any]  # of a reset or a step; and what a reset is told
 Starts = Callable[[np.random.Generator], Any]
 
 
@@ -66,19 +70,16 @@ class RealTask:
         Raises:
           ConfigError: if Gymnasium cannot make it, or has no limit for it and none is given.
         """
-        return cls.of_env(make_gymnasium(env_id, max_steps))
+        return cls.of_env(make_gymnasium(env_id, max_episode_steps=max_steps))
 
     @classmethod
     def of_spec(cls, spec: TaskSpec) -> "RealTask":
         """The task of a proxy's file, without `starts`."""
-        return cls(
-            observation_space=_gymnasium_space(spec.observation),
-            action_space=_gymnasium_space(spec.action),
-            max_steps=spec.max_steps,
-        )
+        observations, actions = map(_gymnasium_space, (spec.observation, spec.action))
+        return cls(observation_space=observations, action_space=actions, max_steps=spec.max_steps)
 
     @classmethod
-    def of_env(cls, env: gymnasium.Env[Any, Any]) -> "RealTask":
+    def of_env(cls, env: Env) -> "RealTask":
         """A task given as an environment with Gymnasium's `TimeLimit` around it.
 
         Raises:
@@ -90,127 +91,98 @@ class RealTask:
             observation_space=env.observation_space,
             action_space=env.action_space,
             max_steps=int(limit or 0),
-            starts=_EnvStarts(env),
-        )
-
-    @property
-    def spec(self) -> TaskSpec:
-        """Its spaces and its limit, as sejax has them.
-
-        Raises:
-          ConfigError: for a space whose elements networks cannot take.
-        """
-        return TaskSpec(
-            observation=space_of(self.observation_space, "task.observation_space"),
-            action=space_of(self.action_space, "task.action_space"),
-            max_steps=self.max_steps,
+            starts=partial(_first_observation, env),
         )
 
 
-class _EnvStarts:
-    """First observations of an environment, as its wrappers show them."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any]):
-        self._env = env
-
-    def __call__(self, rng: np.random.Generator) -> Any:
-        self._env.unwrapped.np_random = rng
-        return self._env.reset()[0]
+def _first_observation(env: Env, rng: np.random.Generator) -> Any:
+    """That of an environment's episode, as its wrappers show it."""
+    env.unwrapped.np_random = rng
+    return env.reset()[0]
 
 
-def make_gymnasium(
-    env_id: str, max_steps: int | None = None, **options: Any
-) -> gymnasium.Env[Any, Any]:
+def make_gymnasium(env_id: str, **options: Any) -> Env:
     """An environment of Gymnasium's registry.
 
     Args:
       env_id: such as `"CartPole-v1"`.
-      max_steps: replaces Gymnasium's limit.
-      **options: of the environment.
+      **options: of `gymnasium.make`, and of the environment.
 
     Raises:
       ConfigError: if Gymnasium cannot make it.
     """
     try:
-        return gymnasium.make(
-            env_id, max_episode_steps=max_steps, disable_env_checker=True, **options
-        )
+        return gymnasium.make(env_id, disable_env_checker=True, **options)
     except (gymnasium.error.Error, ImportError) as error:
         message = f"task must be one that Gymnasium can make here; {env_id} raised {told(error)}."
         raise ConfigError(message, "task") from error
 
 
-def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, Any] | None:
-    """The task that a file names, with its step limit, if Gymnasium or sejax.gym has the same.
+def real_env(header: Header, fix: str, **options: Any) -> Env:
+    """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same.
 
     Args:
-      config: plain values of the task's configuration.
+      header: of the file.
+      fix: what to type where it has none.
       **options: of `gymnasium.make`, such as `render_mode`.
 
     Raises:
-      ConfigError: for an option that the task does not have here, or if Gymnasium cannot make it.
+      ConfigError: if there is none, for an option that the task does not have here, or if Gymnasium
+        cannot make it.
     """
+    config, limit = header.config["env"], header.spec.max_steps
     name = str(config.get("name"))
-    if name not in (*GYMNASIUM_IDS, *MAPS):
-        return None
+    is_known = name in GYMNASIUM_IDS or name in MAPS
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
-    task = registry.configure("env", config)
-    fields = to_plain(task)
-    if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
-        return None
-    max_steps = task.spec.max_steps
+    fields = to_plain(registry.configure("env", config)) if is_known else {}
+    require(
+        is_known and fields.pop("backend", "mujoco") in GYMNASIUM_BACKENDS,
+        "task",
+        f"must be given, because Gymnasium has none that is the same; got {shortened(config)}. Set "
+        f"{fix}, or an id of Gymnasium.",
+    )
     if name in MAPS:
-        return TimeLimit(GridWorld(name, **fields), max_steps)
-    return make_gymnasium(GYMNASIUM_IDS[name], max_steps, **options, **fields)
+        return TimeLimit(GridWorld(name, **fields), limit)
+    return make_gymnasium(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 
 
-def se_task(header: Header, task: RealTask | str | None, needs_starts: bool) -> RealTask:
+def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None) -> RealTask:
     """What an SE takes from its task: from its file if that is enough.
 
     Args:
       header: of the file.
+      config: of the SE.
       task: one that is given, or its id in Gymnasium; None for the file's.
-      needs_starts: whether the SE's episodes begin where the real task's do.
 
     Raises:
-      ConfigError: if it must be given, or the one given has other actions than the file's.
+      ConfigError: if it must be given, or the one given has other actions or another step limit
+        than the file's.
     """
-    learned = RealTask.of_spec(header.spec)
-    if isinstance(task, str):
-        task = RealTask.of_gymnasium(task, learned.max_steps)
+    learned, limit = RealTask.of_spec(header.spec), header.spec.max_steps
+    if task is None and not config.needs_task:
+        return learned
+    # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
+    gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
+    if task is None and gymnax_id in gymnasium.registry:
+        task = gymnax_id
     if task is None:
-        return _task_with_starts(header) if needs_starts else learned
-    require(
-        isinstance(task, RealTask),
-        "task",
-        f"must be a sejax.gym.RealTask or an id of Gymnasium; got {type(task).__name__}. Set "
-        "task=sejax.gym.RealTask.of_env(env).",
-    )
-    require(
-        is_same_space(task.spec.action, header.spec.action),
-        "task",
-        f"must have the actions of the SE's task, {shortened(learned.action_space)}; got "
-        f"{shortened(task.action_space)}. gymnasium.wrappers.RescaleAction makes such.",
-    )
+        task = RealTask.of_env(real_env(header, "task=sejax.gym.RealTask(...)"))
+    if isinstance(task, str):
+        task = RealTask.of_gymnasium(task, limit)
+    got = f"got {shortened(task)}. Set task=sejax.gym.RealTask.of_env(env)."
+    require(isinstance(task, RealTask), "task", f"must be a RealTask or an id of Gymnasium; {got}")
+    actions, wanted = task.action_space, learned.action_space
+    has_actions = is_same_space(space_of(actions, "task.action_space"), header.spec.action)
+    got = f"got {shortened(actions)}. gymnasium.wrappers.RescaleAction makes such."
+    require(has_actions, "task", f"must have the actions of the SE's task, {wanted}; {got}")
+    has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
+    got = f"got {task.max_steps}. Set max_steps={limit}."
+    require(has_limit, "task", f"must have the step limit {limit} of the SE's task; {got}")
     return task
 
 
-def _task_with_starts(header: Header) -> RealTask:
-    """The task of a file from Gymnasium, which may simulate an id of gymnax differently."""
-    config = header.config["env"]
-    env = same_env(config)
-    if env is not None:
-        return RealTask.of_env(env)
-    _, is_gymnax, env_id = str(config.get("name")).partition(GYMNAX)
-    if is_gymnax and env_id in gymnasium.registry:
-        return RealTask.of_gymnasium(env_id, registry.configure("env", config).max_steps)
-    raise _unknown_task(header, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
-
-
-def rn_env(
-    header: Header, env_id: RealTask | str | None, render_mode: str | None
-) -> gymnasium.Env[Any, Any]:
+def rn_env(header: Header, env_id: RealTask | str | None, render_mode: str | None) -> Env:
     """The task of an RN: one that is given by its id, or the file's.
 
     Raises:
@@ -218,25 +190,80 @@ def rn_env(
     """
     fix = "sejax.gym.RewardNetwork(env, source)"
     if env_id is None:
-        env = same_env(header.config["env"], render_mode=render_mode)
-        if env is None:
-            raise _unknown_task(header, fix)
-        return env
-    require(
-        isinstance(env_id, str),
-        "task",
-        f"must be an id of Gymnasium for a reward network; got {shortened(env_id)}. Set {fix}.",
-    )
+        return real_env(header, fix, render_mode=render_mode)
+    got = shortened(env_id)
+    require(isinstance(env_id, str), "task", f"must be an id of Gymnasium; got {got}. Set {fix}.")
     return make_gymnasium(str(env_id), render_mode=render_mode)
 
 
-def _unknown_task(header: Header, fix: str) -> ConfigError:
-    """Error for a task that only the caller can give."""
-    return ConfigError(
-        f"task must be given, because Gymnasium has none that is the same; got "
-        f"{shortened(header.config['env'])}. Set {fix}, or an id of Gymnasium.",
-        "task",
-    )
+# --- grid worlds ----------------------------------------------------------------------------------
+
+MAPS = {"cliff_walking": gridworld.CLIFF_WALKING, "gridworld_2x2": gridworld.ROOM_2X2}
+# Reward of a step into each cell: the start, the floor, the goal and a hole.
+REWARDS = {
+    "cliff_walking": {"S": -1.0, " ": -1.0, "G": 0.0, "O": -100.0},
+    "gridworld_2x2": {"S": -0.01, " ": -0.01, "G": 1.0, "O": -1.0},
+}
+MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
+
+
+class GridWorld(gymnasium.Env[int, int]):
+    """A deterministic world of cells, `sejax.envs.gridworld` step by step.
+
+    Observations are the cell's index, row * number of columns + column. Actions are 0 RIGHT, 1
+    LEFT, 2 DOWN, 3 UP. Entering the goal or a hole (the cliff) terminates; a move off the map stays
+    in place. There is no step limit (see `sejax.gym.make`), and no picture.
+
+    Gymnasium's `CliffWalking-v1` is another task on the same map: its actions are 0 UP, 1 RIGHT, 2
+    DOWN, 3 LEFT, whoever falls off the cliff goes on from the start, and the move into the goal
+    costs 1 like any other.
+
+    Args:
+      name: cliff_walking or gridworld_2x2.
+      goal_reward: of the move into the goal, if not the task's usual one.
+
+    Example:
+      >>> env = GridWorld("gridworld_2x2")
+      >>> env.reset()
+      (0, {})
+      >>> env.step(2)
+      (2, -0.01, False, False, {})
+    """
+
+    def __init__(self, name: str, goal_reward: float | None = None):
+        self._cells = "".join(MAPS[name])
+        height, width = len(MAPS[name]), len(MAPS[name][0])
+        around = np.pad(np.arange(height * width).reshape(height, width), 1, mode="edge")
+        # [action][index]: where a move leads to
+        self._next = [around[1 + y :, 1 + x :][:height, :width].ravel().tolist() for y, x in MOVES]
+        self._rewards = REWARDS[name] | ({} if goal_reward is None else {"G": goal_reward})
+        self._index: int | None = None
+        self.observation_space = spaces.Discrete(len(self._cells))
+        self.action_space = spaces.Discrete(len(MOVES))
+        arguments = {"name": name, "goal_reward": goal_reward}
+        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=arguments)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
+        """Puts the agent on the map's S; `options` has no effect."""
+        super().reset(seed=seed)
+        self._index = self._cells.index("S")
+        return self._index, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, Info]:
+        """Moves by one cell.
+
+        Raises:
+          gymnasium.error.ResetNeeded: if no episode is running.
+          gymnasium.error.InvalidAction: for an action that is none of the four.
+        """
+        if self._index is None:
+            raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
+        if not self.action_space.contains(action):
+            raise gymnasium.error.InvalidAction(f"{action!r} is none of {self.action_space}")
+        obs = self._next[action][self._index]
+        cell = self._cells[obs]
+        self._index = None if cell in "GO" else obs
+        return obs, self._rewards[cell], cell in "GO", False, {}
 
 
 # --- spaces ---------------------------------------------------------------------------------------
@@ -255,10 +282,9 @@ def space_of(space: spaces.Space[Any], name: str) -> Space:
     Raises:
       ConfigError: if its elements are neither vectors nor indices from 0 on.
     """
-    if isinstance(space, spaces.Box) and len(space.shape) == 1:
-        return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
     if isinstance(space, spaces.Discrete) and space.start == 0:
         return Discrete(int(space.n))
-    raise ConfigError(
-        f"{name} must be a Box of vectors or a Discrete from 0; got {shortened(space)}.", name
-    )
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
+    got = shortened(space)
+    raise ConfigError(f"{name} must be a Box of vectors or a Discrete from 0; got {got}.", name)
