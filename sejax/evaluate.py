@@ -45,8 +45,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    composed = configuration.composed_evaluation(overrides)
-    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, composed)}"
+    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:

@@ -42,8 +42,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    composed = configuration.composed_run(overrides)
-    return f"{ABOUT}\n{compose.help_text(LearnConfig, composed)}"
+    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:

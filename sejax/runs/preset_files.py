@@ -20,6 +20,7 @@ from sejax.options.plain import flatten, merge, parsed
 PRESETS = Path(__file__).parents[1] / "presets"
 GENERAL = "general"  # the presets of tasks without a file of their own
 ENDING = ".yaml"  # of a preset file
+NONE = ("agent", "agents")  # fields that an older run's config.yaml has as null
 
 
 @functools.cache
@@ -100,7 +101,7 @@ def values_of(preset: str, chosen: Mapping[str, str], agents: Mapping[str, str])
     values = {k: x for k, x in section.items() if not k.startswith("with_") and k != "objective"}
     with_agent = section.get("with_agent", {})
     settings = {key: with_agent.get(name, {}) for key, name in agents.items()}
-    layers = [section.get(f"with_{x}", {}).get(chosen[x], {}) for x in ("es", "objective")]
+    layers = [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
     layers += settings.values() if len(agents) == 1 else []
     values = merge(values, *layers)
     values.pop("agent", None)
@@ -110,8 +111,6 @@ def values_of(preset: str, chosen: Mapping[str, str], agents: Mapping[str, str])
 
 def read_file(path: Path) -> dict[str, Any]:
     """The values of a user's file, by their full names; `preset: paper` in it is its base.
-
-    A choice may stand beside its fields as `name`, so that a run's `config.yaml` is such a file.
 
     Raises:
       ConfigError: for a file that cannot be read, or that holds no fields.
@@ -137,11 +136,7 @@ def read_file(path: Path) -> dict[str, Any]:
         "preset",
         f"must name no file in a file; got {shortened(base)}. Write preset: best.",
     )
-    chosen = {x.removesuffix(".name"): values.pop(x) for x in [*values] if x.endswith(".name")}
-    keys = [x.removeprefix("agents.") for x in chosen if x.startswith("agents.")]
-    names = {f"agents.{key}.name": chosen.pop(f"agents.{key}") for key in keys}
-    values |= chosen | names | ({"agents": keys} if keys else {})
-    return {k: v for k, v in values.items() if v is not None or k not in ("agent", "agents")}
+    return {name: x for name, x in values.items() if x is not None or name not in NONE}
 
 
 def file_text(overrides: Iterable[str]) -> str:
