@@ -291,6 +291,7 @@ def test_a_preset_file_that_is_not_there_is_one_message(tmp_path):
         ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
         ("agents=[ddqn,ppo] agents.ddqn.batch_size=0", "agents.ddqn.batch_size", ""),
         ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
+        ("agents=[ddqn] agents.ddqn.weight=2", "agents.KEY.weight", "agents=[ddqn,ppo]"),
         ("agents=[ddqn,td3]", "agents.td3", ""),
         ("env=pendulum agent=ddqn", "agent", ""),
         ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),

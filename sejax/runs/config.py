@@ -377,10 +377,9 @@ def _from_plain(
         several = {key_of(str(dict(one).get("name"))): one, **several}
     is_map = isinstance(several, Mapping) and bool(several)
     require(is_map, "agents", f"must be agents by their keys; got {shortened(several)}. {FIX}")
-    shared = {name: several[name] for name in fields_of(MixtureConfig) if name in several}
+    of_mixture = fields_of(MixtureConfig) if schema.learns else ()
+    shared = {name: several[name] for name in of_mixture if name in several}
     of_agents = {str(key): x for key, x in several.items() if key not in shared}
-    is_used = not shared or (schema.learns and len(of_agents) > 1)
-    require(is_used, f"agents.{next(iter(shared), '')}", f"must come with several agents. {FIX}")
     objects["agents"], weights = {}, []
     for key, fields in sorted(of_agents.items()):
         require(key == key_of(key), "agents", f"must be words; got {shortened(key)}. {FIX}")
@@ -391,8 +390,11 @@ def _from_plain(
             own = {k: x for k, x in fields.items() if k not in share}
             objects["agents"][key] = registry.configure("agent", own, imports)
     if schema.learns:
-        objects["weights"] = weights
-        objects["mixture"] = from_plain(MixtureConfig, shared, "agents")
+        mixture = from_plain(MixtureConfig, shared, "agents")
+        objects |= {"weights": weights, "mixture": mixture}
+        is_idle = mixture == MixtureConfig() and {*weights} == {1.0}
+        field = f"agents.{next(iter(shared), 'KEY.weight')}"
+        require(len(weights) > 1 or is_idle, field, f"must come with several agents. {FIX}")
     for group in schema.groups:
         objects[group] = registry.configure(group, objects.get(group, {}), imports)
     fields = fields_of(schema)
