@@ -101,7 +101,8 @@ def compose(
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given, imports, stored = read(overrides), imports_of(overrides), stored or {}
+    given, stored = read(overrides), stored or {}
+    imports = imports_of(overrides)
     of_stored = {group: x["name"] for group, x in stored.items() if group in schema.groups}
     usual: dict[str, Any] = DEFAULTS | of_stored
     chosen = {name: given.get(name, usual[name]) for name in schema.groups}
@@ -109,11 +110,11 @@ def compose(
     names = names or {x: x for x in [_default_agent(schema, given, imports)]}
     preset, of_preset = str(given.get("preset", "best")), {}
     if schema.learns:
-        if "objective" not in given:
-            own = preset_files.objective_of(preset, chosen["env"], chosen["proxy"])
-            proxy = registry.find("proxy", chosen["proxy"], imports)
-            chosen["objective"] = own or proxy.default_objective
-        of_preset = preset_files.values_of(preset, chosen, names)
+        usual_objective = registry.find("proxy", chosen["proxy"], imports).default_objective
+        section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
+        objective = section.get("objective", {}).get("name", usual_objective)
+        chosen["objective"] = given.get("objective", objective)
+        of_preset = {"preset": preset} | preset_files.settings_of(section, chosen, names)
     choices = {group: {"name": name} for group, name in chosen.items()}
     layers = {
         "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
@@ -163,6 +164,12 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
       ConfigError: for what is no word of this form, or several values, and for a file that cannot
         be read.
     """
+    require(
+        isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides),
+        "overrides",
+        f"must be a list of text; got {shortened(repr(overrides))}. Set "
+        'overrides=["env=cartpole"].',
+    )
     given: dict[str, Any] = {}
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")

@@ -458,14 +458,12 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    _require_overrides(overrides)
     composed = compose(LearnConfig, overrides)
     return learn_config(composed.values, composed.imports)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    _require_overrides(overrides)
     composed = compose(EvaluateConfig, overrides, _learned(read(overrides)))
     require(
         "proxy" in composed.values,
@@ -527,12 +525,3 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     default = agents.default_for(EvaluateConfig.spec_for(given))
     keys = agents_of(given) or {default: default}
     return {"agents": {key: by_name.get(name, {"name": name}) for key, name in keys.items()}}
-
-
-def _require_overrides(overrides: object) -> None:
-    require(
-        isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides),
-        "overrides",
-        f"must be a list of text; got {shortened(repr(overrides))}. Set "
-        'overrides=["env=cartpole"].',
-    )
