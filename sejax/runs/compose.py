@@ -115,12 +115,14 @@ def compose(
         objective = section.get("objective", {}).get("name", usual_objective)
         chosen["objective"] = given.get("objective", objective)
         of_preset = {"preset": preset} | preset_files.settings_of(section, chosen, names)
+    typed = {_choice(word.partition("=")[0]) for word in overrides}
     choices = {group: {"name": name} for group, name in chosen.items()}
     layers = {
         "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
         f"preset={preset}": of_preset,
         "proxy": stored,
-        "typed": _nested(given, names, (*schema.groups, "agent", "agents")),
+        "file": _nested({k: x for k, x in given.items() if k not in typed}, names, schema.groups),
+        "typed": _nested({k: x for k, x in given.items() if k in typed}, names, schema.groups),
     }
     return Composed(merge(*layers.values()), layers, imports)
 
@@ -134,13 +136,13 @@ def _default_agent(
 
 
 def _nested(
-    given: Mapping[str, Any], agents: Collection[str], choices: Collection[str]
+    given: Mapping[str, Any], agents: Collection[str], groups: Collection[str]
 ) -> dict[str, Any]:
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
     for name, value in given.items():
         first, *rest = name.split(".")
-        if name in choices:
+        if name in (*groups, "agent", "agents"):
             continue
         path = [first, *rest]
         if first == "agent":
