@@ -123,9 +123,7 @@ class SyntheticConfig(ProxyConfig):
         ),
     )
     reward_slope: float = option(
-        1.0,
-        positive("a reward must tell actions apart"),
-        help="What such a reward takes for each unit of it.",
+        1.0, positive("a reward must tell actions apart"), help="Reward lost for each unit of it."
     )
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
     horizon_is_terminal: bool = option(

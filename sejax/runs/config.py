@@ -75,10 +75,7 @@ class CommandConfig(Options):
     num_parallel: int | None = option(
         None,
         counts("something must compute"),
-        help=(
-            "Agents that train side by side on one device; null: what suits the agent and the "
-            "device."
-        ),
+        help="agents side by side on a device; null: what suits",
     )
     devices: int | None = option(None, counts("something must compute"), help="null: all")
 
@@ -138,15 +135,10 @@ class LearnConfig(CommandConfig):
     agent_hparams: str = option(
         "default",
         one_of(AGENT_HPARAMS),
-        help=(
-            "default: the agent's; varied: learning rate, batch and network drawn anew for each "
-            "training."
-        ),
+        help="varied: rate, batch, network drawn for each training",
     )
     generations: int = option(
-        100,
-        counts("there is nothing to do otherwise", most=1_000_000),
-        help="n_o: steps of the outer loop.",
+        100, counts("there is nothing to do otherwise", most=1_000_000), help="n_o: outer steps"
     )
     num_seeds: int = option(
         1, counts("it counts runs"), help="Independent runs, with seeds seed, seed + 1, ..."
