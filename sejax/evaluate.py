@@ -5,19 +5,22 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
+import pandas as pd
 import yaml
+from rich.console import Console
+from rich.table import Table
 
 from sejax.agents import make_agent
+from sejax.evaluation import evaluate_agents
 from sejax.ops.files import require_writable, write_text
-from sejax.runs import commands, compose, runtime
+from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
+from sejax.runs.progress import Tally
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
-
-if TYPE_CHECKING:  # which takes 0.3 s to import
-    import pandas as pd
 
 ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
 
@@ -45,8 +48,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    composed = configuration.composed_evaluation(overrides)
-    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, composed)}"
+    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:
@@ -78,10 +80,6 @@ def evaluate(config: EvaluateConfig) -> float:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
         cannot be written.
     """
-    import pandas as pd
-
-    from sejax.runs import plots
-
     setup = real_setup(config) if config.proxy == "real" else proxy_setup(config)
     out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
@@ -101,14 +99,8 @@ def evaluate(config: EvaluateConfig) -> float:
     return float(first["test_return"].mean())
 
 
-def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> "pd.DataFrame":
+def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
     """A row for each agent of a kind."""
-    import jax
-    import pandas as pd
-
-    from sejax.evaluation import evaluate_agents
-    from sejax.runs.progress import Tally
-
     env, env_params, trainings = setup.worlds[world]
     varied = config.agent_hparams == "varied"
     agent = make_agent(setup.agents[key], setup.task, setup.exploration, varied)
@@ -140,7 +132,7 @@ def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) 
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 
-def summarise(table: "pd.DataFrame", by: list[str]) -> "pd.DataFrame":
+def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Mean and standard deviation of each column for each group.
 
     A test return that is not a number counts as the worst of all.
@@ -152,7 +144,7 @@ def summarise(table: "pd.DataFrame", by: list[str]) -> "pd.DataFrame":
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
 
 
-def _as_json(summary: "pd.DataFrame") -> str:
+def _as_json(summary: pd.DataFrame) -> str:
     """An object for each world; with several agents, in it one for each of them."""
     if summary.index.nlevels == 1:
         return str(summary.to_json(orient="index", indent=2))
@@ -166,10 +158,7 @@ def spread(mean: float, std: float, digits: int) -> str:
     return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
-def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
     who = "agents of each kind" if setup.has_several else f"{next(iter(setup.agents))} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""

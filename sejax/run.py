@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import yaml
 
 from sejax.options import FailedError
-from sejax.runs import commands, compose, runtime
+from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
@@ -42,8 +42,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    composed = configuration.composed_run(overrides)
-    return f"{ABOUT}\n{compose.help_text(LearnConfig, composed)}"
+    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:
@@ -101,13 +100,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     with contextlib.ExitStack() as machines:
         compiled = None
         for config in configs:
-            # Before the task is imported, so that a refusal is quick.
             with open_for(config) as directory, RunProgress(config) as progress:
                 try:
-                    if compiled is None:
-                        progress.status("importing jax and the task")
-                    from sejax.runs import session
-
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:
                         machines.close()

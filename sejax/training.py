@@ -60,33 +60,23 @@ class TrainingConfig(Options):
         2000, counts("it counts episodes"), help="n_e: of a training at most"
     )
     min_steps: int = option(
-        0,
-        counts("it counts steps", least=0),
-        help="The stop rule waits for so many training steps.",
+        0, counts("it counts steps", least=0), help="The stop rule waits for so many steps."
     )
     max_steps: int | None = option(
-        2000,
-        counts("an agent must train"),
-        help="Training ends after so many steps, whatever the rule says.",
+        2000, counts("an agent must train"), help="The most steps, whatever the rule says."
     )
     stop_rule: str = option("never", one_of(STOP_RULES), help="plateau (SEs), solved (real tasks)")
     window: int = option(
-        10,
-        counts("it counts episodes"),
-        help="d: episodes in each of the two means that the plateau rule compares",
+        10, counts("it counts episodes"), help="d: episodes of each mean that plateau compares"
     )
     plateau_tolerance: float = option(
-        0.01,
-        not_negative("it bounds a relative change"),
-        help="C_diff: relative change between them that counts as flat",
+        0.01, not_negative("it bounds a relative change"), help="C_diff: change that counts as flat"
     )
     solved_by: str = option(
         "test", one_of(SOLVED_BY), help="Whose last d returns must reach the solved reward."
     )
     test_episodes: int = option(
-        10,
-        counts("it counts episodes"),
-        help="n_te: greedy episodes on the real task after training",
+        10, counts("it counts episodes"), help="n_te: greedy episodes on the real task at its end"
     )
     tests_between: int = option(
         0,

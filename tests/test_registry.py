@@ -51,10 +51,9 @@ def module(tmp_path, monkeypatch, request):
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
-def test_defaults_configure_and_describe_are_inverses(group, name):
+def test_configure_and_describe_are_inverses(group, name):
     config = registry.configure(group, {"name": name})
     plain = registry.describe(group, config)
-    assert plain == registry.defaults(group, name)
     assert registry.configure(group, plain) == config
     assert registry.name_of(group, config) == name
     assert type(config) is registry.find(group, name)
@@ -212,8 +211,6 @@ def test_a_dataclass_of_ones_own_is_found_by_its_module_and_name(module):
     config = registry.configure("objective", {"name": name, "scale": 3, "needed": 1})
     assert config.scale == 3.0 and registry.name_of("objective", config) == name
     assert registry.configure("objective", registry.describe("objective", config)) == config
-    expected = {"name": name, "scale": 2.0, "needed": "???"}
-    assert registry.defaults("objective", name) == expected
     objective = registry.make("objective", config, envs.make("cartpole"))
     assert isinstance(objective, sejax.Objective)
     assert registry.find("objective", name.replace("Scaled", "Outer.Inner")) is type(config)

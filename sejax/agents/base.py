@@ -218,9 +218,7 @@ class AgentOptions(AgentConfig):
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
     warmup_episodes: int = option(
-        1,
-        counts("it counts episodes", least=0),
-        help="Episodes before learning starts and before a stop rule may judge.",
+        1, counts("it counts episodes", least=0), help="Episodes before it learns or stops."
     )
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:

@@ -325,9 +325,7 @@ class CountBasedConfig(ExplorationConfig):
 
     reward_scale: float = option(0.1, not_negative("it scales a bonus"), help="beta")
     count_power: float = option(
-        1.0,
-        positive("the bonus would not fade"),
-        help="p: 1 in the paper's text, 0.5 in the authors' code",
+        1.0, positive("the bonus would not fade"), help="p: 1 in the paper, 0.5 in its code"
     )
 
     def make(self, agent: Agent, task: Task) -> Agent:

@@ -63,9 +63,7 @@ class PPOConfig(TorsoOptions):
     learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
     rollout_steps: int | None = option(
-        128,
-        counts(),
-        help="Decisions between two learning phases; null: as `update_episodes` says.",
+        128, counts(), help="Decisions between learning phases; null: as `update_episodes` says."
     )
     update_episodes: int = option(10, counts(), help="of full length, between two learning phases")
     epochs: int = option(10, counts(), help="passes over the rollout in a learning phase")

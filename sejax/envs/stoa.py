@@ -66,9 +66,7 @@ class StoaTask(Options):
         None, help="mean return that counts as solved; null: undefined"
     )
     max_steps: int | None = option(
-        None,
-        counts("an episode has steps"),
-        help="null: the environment's own, or 1,000 where it has none.",
+        None, counts("an episode has steps"), help="null: the environment's own, or 1,000"
     )
 
     def make(self) -> Task:

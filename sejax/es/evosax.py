@@ -55,14 +55,10 @@ class EvosaxConfig(StrategyOptions):
     name: str = option("open_es", one_of(ALGORITHMS))
     population_size: int = 32
     num_incumbent_evals: int = option(
-        16,
-        counts("the incumbent's score selects the proxy"),
-        help="Agents trained on the distribution's mean.",
+        16, counts("the incumbent's score selects the proxy"), help="Agents trained on the mean."
     )
     noise_std: float = option(
-        0.05,
-        positive("candidates must differ", MAX_SCALE),
-        help="Initial std of the search distribution.",
+        0.05, positive("candidates must differ", MAX_SCALE), help="Initial std of the distribution."
     )
     noise_std_decay: float = option(
         1.0, shrinks(), help="Factor for each generation, of open_es alone."

@@ -129,7 +129,10 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
         fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
         is_read = isinstance(value, hint | Mapping)
         require(is_read, name, f"must {fields}; got {shortened(repr(value))}. Leave it out.")
-        return value if isinstance(value, hint) else from_plain(hint, value, name, imports)
+        if isinstance(value, hint):
+            return value
+        base = to_plain(default) if isinstance(default, hint) else {}
+        return from_plain(hint, base | value, name, imports)
     if isinstance(value, str):
         text = expanded(value)
         candidates = parsed(text), text

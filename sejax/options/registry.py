@@ -49,7 +49,7 @@ from sejax.options import (
     told,
     unknown_name,
 )
-from sejax.options.plain import MISSING, fields_of, from_plain, require_typed, to_plain
+from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,6 @@ def configure(
     group: str,
     values: Mapping[str, Any],
     imports: Collection[str] | None = None,
-    where: str = "",
 ) -> Any:
     """The configuration that plain values describe: the field `name`, and those of the plugin.
 
@@ -255,7 +254,6 @@ def configure(
       group: one of `GROUPS`.
       values: by the names of the fields.
       imports: each `module:attribute` that may be imported; None: any.
-      where: what messages call it, if not by its group.
 
     Raises:
       ConfigError: for an unknown name or field, or a value that cannot be.
@@ -264,27 +262,31 @@ def configure(
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
       0.9
     """
-    where = where or group
     require(
         isinstance(values, Mapping) and "name" in values,
-        where,
+        group,
         f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME.",
     )
     cls = find(group, values["name"], imports)
     fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
-    return from_plain(cls, fields, where, imports)
+    try:
+        return from_plain(cls, fields, group, imports)
+    except ConfigError as error:
+        raise _of_another(group, error) or error from None
+
+
+def _of_another(group: str, error: ConfigError) -> ConfigError | None:
+    """The error of a field that this choice has not, but another one that comes with sejax."""
+    field = error.field.removeprefix(f"{group}.")
+    others = [x for x in GROUPS[group].built_in if field in fields_of(find(group, x))]
+    if not others or "is no field" not in str(error):
+        return None
+    return ConfigError(f"{error.field} is a field of {group}={others[0]}. Set that.", error.field)
 
 
 def describe(group: str, config: object) -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
-
-
-def defaults(group: str, name: str) -> dict[str, Any]:
-    """What `describe` gives for a choice with its defaults; "???" for a field without one."""
-    fields = fields_of(find(group, name)).items()
-    plain = {field: "???" if value is MISSING else to_plain(value) for field, value in fields}
-    return plain | {"name": name}
 
 
 # --- objects -------------------------------------------------------------------------------------

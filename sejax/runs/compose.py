@@ -2,11 +2,13 @@
 
 A word is `group=choice`, `group.field=value` or `field=value`. `read` splits words into names and
 texts. `compose` finds the choice of every group (the given one, else what the task and the proxy
-suggest), checks that each name is a field of these choices, and lays the layers on each other:
-defaults, the preset or what a stored proxy was learned with, the user's file, the words.
+suggest), and lays the layers on each other: the choices, the preset or what a stored proxy was
+learned with, the user's file and the words. Whether their names are fields of the choices shows
+when dataclasses are made of them.
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import itertools
 import re
@@ -17,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from sejax import agents
-from sejax.agents.mixture import MixtureConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -29,22 +30,17 @@ from sejax.options import (
     registry,
     require,
     shortened,
-    unknown_name,
 )
 from sejax.options.plain import (
-    MISSING,
     expanded,
-    fields_of,
     flatten,
     merge,
     parsed,
     split,
     to_plain,
-    unknown_field,
     unquoted,
 )
 from sejax.runs import preset_files
-from sejax.training import TrainingConfig
 
 if TYPE_CHECKING:
     from sejax.runs.config import CommandConfig
@@ -60,7 +56,6 @@ DEFAULTS = {
     "machines": "local",
 }
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
-SEVERAL = "Set agents=[ddqn,ppo]."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,13 +77,11 @@ class Composed:
 
     Attributes:
       values: nested plain values; fields that no layer sets are left out.
-      fields: default and help text of each field of the choices, by their full names.
-      layers: where the values come from, in the order in which one lies on another.
+      layers: the same, where they come from, in the order in which one lies on another.
       imports: each `module:attribute` that the words name, which may be imported.
     """
 
     values: dict[str, Any]
-    fields: dict[str, tuple[Any, str]]
     layers: dict[str, Mapping[str, Any]]
     imports: frozenset[str]
 
@@ -98,7 +91,7 @@ def compose(
     overrides: Sequence[str],
     stored: Mapping[str, Any] | None = None,
 ) -> Composed:
-    """Composes a command's words over its preset and its defaults.
+    """Composes a command's words over its preset and its choices.
 
     Args:
       schema: the command's configuration.
@@ -106,40 +99,61 @@ def compose(
       stored: what a stored proxy was learned with, nested plain values.
 
     Raises:
-      ConfigError: for words that cannot be.
+      ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
     given, stored = read(overrides), stored or {}
     imports = imports_of(overrides)
-    keys = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
-    chosen = _choices(schema, given, stored, imports)
-    keys = keys or {key_of(name): name for name in [_default_agent(schema, given, imports)]}
-    for name in keys.values():
-        with errors_of("agent", "agents" if len(keys) > 1 else "agent"):
-            registry.find("agent", name, imports)
-    fields = _fields(schema, chosen, keys, imports)
-    settings = {}
-    chosen_by = {*schema.groups, "agent", "agents", *(f"agents.{key}.name" for key in keys)}
-    for name, value in given.items():
-        if name not in chosen_by:
-            shown = _shown(name, keys)
-            _require_field(shown, value, chosen, fields)
-            settings[_path(shown, keys)] = value
-    choices: dict[str, Any] = {group: {"name": name} for group, name in chosen.items()}
-    choices |= {"agents": {key: {"name": name} for key, name in keys.items()}}
-    trainings = {k: x for k, x in fields_of(schema).items() if isinstance(x, TrainingConfig)}
-    preset = given.get("preset", "best")
-    layers: dict[str, Mapping[str, Any]] = {
-        "default": choices | to_plain(trainings),
-        f"preset={preset}": preset_files.values_of(preset, chosen, keys) if schema.learns else {},
+    of_stored = {group: x["name"] for group, x in stored.items() if group in schema.groups}
+    usual: dict[str, Any] = DEFAULTS | of_stored
+    chosen = {name: given.get(name, usual[name]) for name in schema.groups}
+    names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
+    names = names or {x: x for x in [_default_agent(schema, given, imports)]}
+    preset, of_preset = str(given.get("preset", "best")), {}
+    if schema.learns:
+        usual_objective = registry.find("proxy", chosen["proxy"], imports).default_objective
+        section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
+        objective = section.get("objective", {}).get("name", usual_objective)
+        chosen["objective"] = given.get("objective", objective)
+        of_preset = {"preset": preset} | preset_files.settings_of(section, chosen, names)
+    typed = {_choice(word.partition("=")[0]) for word in overrides}
+    choices = {group: {"name": name} for group, name in chosen.items()}
+    layers = {
+        "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
+        f"preset={preset}": of_preset,
         "proxy": stored,
-        "typed": merge(*(_nested(name, x) for name, x in settings.items())),
+        "file": _nested({k: x for k, x in given.items() if k not in typed}, names, schema.groups),
+        "typed": _nested({k: x for k, x in given.items() if k in typed}, names, schema.groups),
     }
-    return Composed(merge(*layers.values()), fields, layers, imports)
+    return Composed(merge(*layers.values()), layers, imports)
 
 
-def _nested(name: str, value: object) -> dict[str, Any]:
-    first, _, rest = name.partition(".")
-    return {first: _nested(rest, value) if rest else value}
+def _default_agent(
+    schema: "type[CommandConfig]", given: Mapping[str, Any], imports: Collection[str]
+) -> str:
+    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
+        return agents.default_for(schema.spec_for(given, imports))
+    return agents.DEFAULTS[0]
+
+
+def _nested(
+    given: Mapping[str, Any], agents: Collection[str], groups: Collection[str]
+) -> dict[str, Any]:
+    """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
+    tree: dict[str, Any] = {}
+    for name, value in given.items():
+        first, *rest = name.split(".")
+        if name in (*groups, "agent", "agents"):
+            continue
+        path = [first, *rest]
+        if first == "agent":
+            key, got = next(iter(agents)), shortened(value)
+            message = f"must be one agent's; got {got}. Set agents.{key}{name[5:]}={got}."
+            require(len(agents) == 1, name, message)
+            path = ["agents", key, *rest]
+        for part in reversed(path):
+            value = {part: value}
+        tree = merge(tree, value)
+    return tree
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -152,6 +166,12 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
       ConfigError: for what is no word of this form, or several values, and for a file that cannot
         be read.
     """
+    require(
+        isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides),
+        "overrides",
+        f"must be a list of text; got {shortened(repr(overrides))}. Set "
+        'overrides=["env=cartpole"].',
+    )
     given: dict[str, Any] = {}
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
@@ -178,13 +198,19 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
         of_file = preset_files.read_file(Path(expanded(given.pop("preset"))))
         rechosen = ("agent", "agents") if {"agent", "agents"} & given.keys() else ()
         given = {k: x for k, x in of_file.items() if k not in rechosen} | given
-    return given
+    # A choice may stand beside its fields, as in a run's config.yaml.
+    return {_choice(name): value for name, value in given.items()}
+
+
+def _choice(name: str) -> str:
+    group = name.removesuffix(".name")
+    return group if group in registry.GROUPS else name
 
 
 def imports_of(overrides: Sequence[str]) -> frozenset[str]:
     """Each `module:attribute` that words name, by itself or in a list."""
     texts = (parsed(override.partition("=")[2]) for override in overrides)
-    items = itertools.chain.from_iterable(x if isinstance(x, list) else [x] for x in texts)
+    items = itertools.chain.from_iterable(map(_as_list, texts))
     return frozenset(x for x in items if isinstance(x, str) and ":" in x)
 
 
@@ -243,18 +269,6 @@ def field_of(key: str, keys: Collection[str]) -> str:
     return f"agents.{key}" if len(keys) > 1 else "agent"
 
 
-def _path(name: str, keys: Collection[str]) -> str:
-    """Where a word's value has its place: `agents.KEY.field` for `agent.field`."""
-    first, _, rest = name.partition(".")
-    return f"agents.{next(iter(keys))}.{rest}" if first == "agent" else name
-
-
-def _shown(name: str, keys: Collection[str]) -> str:
-    """The one name of a word's field: of one agent `agent.field`, also if given as `agents.KEY`."""
-    own = f"agents.{next(iter(keys))}."
-    return f"agent.{name.removeprefix(own)}" if len(keys) == 1 and name.startswith(own) else name
-
-
 @contextlib.contextmanager
 def errors_of(group: str, where: str) -> Iterator[None]:
     """Errors about a group in here name the place where it stands, such as `agents.ddqn`."""
@@ -265,158 +279,62 @@ def errors_of(group: str, where: str) -> Iterator[None]:
 
 
 def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
-    """The names of the agents by their keys, which `agent=ddqn` or `agents=[ddqn,ppo]` chooses.
+    """The names of agents by their keys; empty where none is chosen.
 
-    A key is the agent's name, or any word with `agents.KEY.name`. Empty where none is chosen.
+    `agent=ddqn` and `agents=[ddqn,ppo]` choose them, and `agents.KEY.name=ddqn` by any key.
     """
-    field = "agents" if given.get("agents") is not None else "agent"
-    asked = given.get(field)
-    names = parsed(asked) if isinstance(asked, str) else asked
-    if names is None:
-        return {}
-    is_one = field == "agent" or not isinstance(names, list)
-    names = [names] if is_one else names
-    require(names, field, f"must hold an agent; got none. {SEVERAL}")
-    for name in names:
-        require(
-            not isinstance(name, list),
-            field,
-            f"must be one agent; got {shortened(asked)}. Set agents={shortened(as_text(name))}.",
-        )
-        if not isinstance(name, str):
-            raise unknown_name(field, name, registry.names("agent"))
-    keys = {key_of(name): name for name in names}
-    several = shortened(",".join(dict.fromkeys(names)))
-    require(
-        len(keys) == len(names),
-        field,
-        f"must name each agent once; got {shortened(asked)}. Set agents=[{several}].",
-    )
-    extra = next((x for x in given if x == "agent" or x.startswith("agent.")), "")
-    got, rest = shortened(given.get(extra)), extra.removeprefix("agent")
-    fix = f"agents.{key_of(names[0])}{rest}={got}" if rest else f"agents=[{several},{got}]"
-    is_clear = field == "agent" or not extra or (rest and len(keys) == 1)
-    require(is_clear, extra, f"must be left out with agents=[{several}]; got {got}. Set {fix}.")
-    return {key: str(given.get(f"agents.{key}.name", name)) for key, name in keys.items()}
+    asked = {name: given[name] for name in ("agents", "agent") if given.get(name) is not None}
+    chosen: dict[str, str] = {}
+    for field, value in asked.items():
+        names = parsed(value) if isinstance(value, str) else value
+        names = [x if isinstance(x, str) else as_text(x) for x in _as_list(names)]
+        got = shortened(value)
+        several = shortened(",".join(dict.fromkeys([*chosen.values(), *names])))
+        require(names, field, f"must hold an agent; got {got}. Set agents=[ddqn,ppo].")
+        is_clear = not chosen and len({*names}) == len(names)
+        require(is_clear, field, f"must name each agent once; got {got}. Set agents=[{several}].")
+        chosen = {key_of(name): name for name in names}
+    by_key = re.compile(r"agents\.([\w-]+)\.name")
+    named = {match[1]: str(x) for name, x in given.items() if (match := by_key.fullmatch(name))}
+    return chosen | named
 
 
-# --- choices -------------------------------------------------------------------------------------
-
-
-def _default_agent(
-    schema: "type[CommandConfig]", given: Mapping[str, Any], imports: Collection[str]
-) -> str:
-    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
-        return agents.default_for(schema.spec_for(given, imports))
-    return agents.DEFAULTS[0]
-
-
-def _choices(
-    schema: "type[CommandConfig]",
-    given: Mapping[str, Any],
-    stored: Mapping[str, Any],
-    imports: Collection[str],
-) -> dict[str, str]:
-    """The choice of every group but the agents."""
-    known = DEFAULTS | {group: stored[group]["name"] for group in schema.groups if group in stored}
-    chosen = {group: given.get(group, known[group]) for group in schema.groups}
-    for group, choice in chosen.items():
-        names = parsed(choice) if isinstance(choice, str) else choice
-        if isinstance(names, list):
-            first = shortened(as_text(names[0] if names else DEFAULTS[group]))
-            message = f"must be one choice; got {shortened(choice)}. Set {group}={first}."
-            raise ConfigError(f"{group} {message}", group)
-        registry.find(group, choice, imports)
-    if schema.learns and "objective" not in given:
-        preset, names = given.get("preset", "best"), (chosen["env"], chosen["proxy"])
-        default = registry.find("proxy", chosen["proxy"], imports).default_objective
-        chosen["objective"] = preset_files.objective_of(preset, *names) or default
-    return chosen
-
-
-def _fields(
-    schema: "type[CommandConfig]",
-    chosen: Mapping[str, str],
-    keys: Mapping[str, str],
-    imports: Collection[str],
-) -> dict[str, tuple[Any, str]]:
-    """Defaults and help texts of the fields that these choices have, by their full names."""
-    classes: list[tuple[str, type]] = [("", schema)]
-    classes += [(group, registry.find(group, name, imports)) for group, name in chosen.items()]
-    for key, name in keys.items():
-        classes += [(field_of(key, keys), registry.find("agent", name, imports))]
-        classes += [(field_of(key, keys), Share)] if len(keys) > 1 and schema.learns else []
-    classes += [("agents", MixtureConfig)] if len(keys) > 1 and schema.learns else []
-    own = fields_of(schema).items()
-    classes += [(name, type(x)) for name, x in own if isinstance(x, TrainingConfig)]
-    found = {}
-    for group, cls in classes:
-        texts = help_texts(cls)
-        for name, default in fields_of(cls).items():
-            full = f"{group}.{name}".lstrip(".")
-            if name != "name" and full not in (*schema.groups, *dict(classes), *schema.made):
-                found[full] = default, texts.get(name, "")
-    return found
-
-
-def _require_field(
-    name: str, value: object, chosen: Mapping[str, str], fields: Mapping[str, tuple[Any, str]]
-) -> None:
-    """Checks that a word names a field of these choices.
-
-    Raises:
-      ConfigError: if it does not, with what may be meant.
-    """
-    if any(name == field or name.startswith(f"{field}.") for field in fields):
-        return
-    group, _, last = name.rpartition(".")
-    known = registry.GROUPS[group].built_in if group in registry.GROUPS else ()
-    others = [choice for choice in known if last in fields_of(registry.find(group, choice))]
-    got = shortened(value)
-    if last == "name" and group in registry.GROUPS:
-        message = f"must be left out; got {got}. Set {group}={got}."
-    elif name.startswith("agents.") and not any(x.startswith("agents.") for x in fields):
-        message = f"must come with several agents; got {got}. {SEVERAL}"
-    elif others:
-        choice = shortened(chosen.get(group, "this one"))
-        message = f"is no field of {group}={choice}; got {got}. Set {group}={others[0]}."
-    else:
-        raise unknown_field(name, list(fields))
-    raise ConfigError(f"{name} {message}", name)
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 # --- help ----------------------------------------------------------------------------------------
 
 
-def help_text(schema: "type[CommandConfig]", composed: Composed) -> str:
+def list_fields(config: "CommandConfig", layers: Mapping[str, Mapping[str, Any]]) -> str:
     """What `--help` lists: the choices of each group, and the fields of these choices.
 
     A value that is no default has the layer beside it that it comes from.
 
     Args:
-      schema: the command's configuration.
-      composed: what the words beside `--help` compose.
+      config: what the words beside `--help` describe.
+      layers: from which it was composed.
     """
     lines = ["Choices (group=choice):"]
-    for group in ("agent", *schema.groups):
+    for group in ("agent", *config.groups):
         prefixes = [f"{start}ID" for start in registry.GROUPS[group].prefixes]
         known = [*registry.names(group), *prefixes, "module:attribute"]
         lines += [f"  {group}: {', '.join(known)}"]
     lines += ["  agents: [agent,agent,...]"]
-    if schema.learns:
+    if config.learns:
         lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
-    keys = composed.values["agents"]
-    values: dict[str, Any] = {}
-    sources: dict[str, str] = {}
-    for layer, nested in composed.layers.items():
-        flat = flatten(nested)
-        values |= flat
-        sources |= dict.fromkeys(flat, "" if layer == "default" else f" ({layer})")
     lines += ["", "Fields of these choices (field=value), with their values:"]
-    for name, (default, text) in composed.fields.items():
-        path = _path(name, keys)
-        value = values.get(path, None if default is MISSING else to_plain(default))
-        about = f"  # {text}" if text else ""
-        lines += [f"  {name}={as_text(value)}{about}{sources.get(path, '')}"]
+    sources: dict[str, str] = {}
+    for layer, values in layers.items():
+        sources |= dict.fromkeys(flatten(values), "" if layer == "default" else f" ({layer})")
+    for shown, path, part in config.sections():
+        texts = help_texts(type(part))
+        for name, value in vars(part).items():
+            if name in ("name", "agents", "weights") or dataclasses.is_dataclass(value):
+                continue
+            about = f"  # {texts[name]}" if name in texts else ""
+            source = sources.get(f"{path}.{name}".lstrip("."), "")
+            field = f"{shown}.{name}".lstrip(".")
+            lines += [f"  {field}={as_text(to_plain(value))}{about}{source}"]
     wrap = textwrap.TextWrapper(98, subsequent_indent="      ", break_long_words=False)
     return "\n".join(wrap.fill(line) for line in lines)

@@ -6,7 +6,7 @@ value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -27,17 +27,17 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import fields_of, flatten, from_plain, to_plain
+from sejax.options.plain import fields_of, flatten, from_plain, to_plain, unknown_field
 from sejax.proxies import header
 from sejax.runs.compose import (
     DEFAULTS,
-    Composed,
     Share,
     agents_of,
     compose,
     errors_of,
     field_of,
     key_of,
+    list_fields,
     read,
 )
 from sejax.training import TrainingConfig, require_reachable
@@ -48,6 +48,7 @@ TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 JOINT = "+"  # between several agents, in names
+FIX = "Set agents=[ddqn,ppo]."
 Schema = TypeVar("Schema", bound="CommandConfig")
 
 
@@ -61,13 +62,11 @@ class CommandConfig(Options):
     Attributes:
       groups: the groups of plugins whose choices are fields.
       learns: whether proxies are learned: presets have settings, several agents have shares.
-      made: fields that are made of `agents`, the only one of them in words and files.
       agents: by their keys, in the order of these; see `sejax.runs.compose.agents_of`.
     """
 
     groups: ClassVar[tuple[str, ...]] = ()
     learns: ClassVar[bool] = False
-    made: ClassVar[tuple[str, ...]] = ("agents", "weights", "mixture")
 
     agents: dict[str, AgentConfig]
     exploration: ExplorationConfig = option(help="intrinsic reward of the agents")
@@ -76,10 +75,7 @@ class CommandConfig(Options):
     num_parallel: int | None = option(
         None,
         counts("something must compute"),
-        help=(
-            "Agents that train side by side on one device; null: what suits the agent and the "
-            "device."
-        ),
+        help="agents side by side on a device; null: what suits",
     )
     devices: int | None = option(None, counts("something must compute"), help="null: all")
 
@@ -92,6 +88,15 @@ class CommandConfig(Options):
     def field_of(self, key: str) -> str:
         """The name of an agent's fields in words and messages."""
         return field_of(key, self.agents)
+
+    def sections(self) -> Iterator[tuple[str, str, Any]]:
+        """Each dataclass that has fields: their prefixes in words and in files, and itself."""
+        yield "", "", self
+        for key, agent in self.agents.items():
+            yield self.field_of(key), f"agents.{key}", agent
+        for name, value in vars(self).items():
+            if dataclasses.is_dataclass(value) and name != "mixture":
+                yield name, name, value
 
     @staticmethod
     def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:
@@ -130,15 +135,10 @@ class LearnConfig(CommandConfig):
     agent_hparams: str = option(
         "default",
         one_of(AGENT_HPARAMS),
-        help=(
-            "default: the agent's; varied: learning rate, batch and network drawn anew for each "
-            "training."
-        ),
+        help="varied: rate, batch, network drawn for each training",
     )
     generations: int = option(
-        100,
-        counts("there is nothing to do otherwise", most=1_000_000),
-        help="n_o: steps of the outer loop.",
+        100, counts("there is nothing to do otherwise", most=1_000_000), help="n_o: outer steps"
     )
     num_seeds: int = option(
         1, counts("it counts runs"), help="Independent runs, with seeds seed, seed + 1, ..."
@@ -152,6 +152,13 @@ class LearnConfig(CommandConfig):
     run_dir: str | None = option(
         None, help="null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>"
     )
+
+    def sections(self) -> Iterator[tuple[str, str, Any]]:
+        yield from super().sections()
+        if len(self.agents) > 1:
+            yield "agents", "agents", self.mixture
+            for key, weight in zip(self.agents, self.weights, strict=True):
+                yield self.field_of(key), f"agents.{key}", Share(weight=weight)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -357,38 +364,36 @@ def _from_plain(
     schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
 ) -> Schema:
     objects = dict(values)
-    one, several = objects.pop("agent", None), objects.pop("agents", None)
-    require(
-        one is None or several is None,
-        "agent",
-        f"must be left out with agents; got {shortened(one)}. Set agents=[...] alone.",
-    )
-    if isinstance(one, Mapping):
-        several = {key_of(str(one.get("name"))): one}
-    require(
-        isinstance(several, Mapping),
-        "agents",
-        f"must be agents by their keys; got {shortened(several or one)}. Set agents=[ddqn,ppo].",
-    )
-    of_agents = {str(key): x for key, x in several.items()}
-    shared = {name: of_agents.pop(name) for name in fields_of(MixtureConfig) if name in of_agents}
-    require(of_agents, "agents", "must hold an agent; got none. Set agents=[ddqn,ppo].")
+    one, several = objects.pop("agent", None), objects.pop("agents", None) or {}
+    if one is not None:  # as an older file has it
+        several = {key_of(str(dict(one).get("name"))): one, **several}
+    is_map = isinstance(several, Mapping) and bool(several)
+    require(is_map, "agents", f"must be agents by their keys; got {shortened(several)}. {FIX}")
+    of_mixture = fields_of(MixtureConfig) if schema.learns else ()
+    shared = {name: several[name] for name in of_mixture if name in several}
+    of_agents = {str(key): x for key, x in several.items() if key not in shared}
     objects["agents"], weights = {}, []
-    for key in sorted(of_agents):
-        where, fields = field_of(key, of_agents), of_agents[key]
-        is_word = key == key_of(key)
-        require(is_word, where, f"must be a word; got {shortened(key)}. Set agents=[ddqn,ppo].")
-        fields = dict(fields) if isinstance(fields, Mapping) else {}
-        share = {"weight": fields.pop("weight")} if "weight" in fields else {}
+    for key, fields in sorted(of_agents.items()):
+        require(key == key_of(key), "agents", f"must be words; got {shortened(key)}. {FIX}")
+        where, fields = field_of(key, of_agents), fields if isinstance(fields, Mapping) else {}
+        share = {k: x for k, x in fields.items() if k == "weight" and schema.learns}
         weights.append(from_plain(Share, share, where).weight)
-        objects["agents"][key] = registry.configure("agent", fields, imports, where)
+        with errors_of("agent", where):
+            own = {k: x for k, x in fields.items() if k not in share}
+            objects["agents"][key] = registry.configure("agent", own, imports)
     if schema.learns:
-        objects["weights"] = weights
-        objects["mixture"] = from_plain(MixtureConfig, shared, "agents")
+        mixture = from_plain(MixtureConfig, shared, "agents")
+        objects |= {"weights": weights, "mixture": mixture}
+        is_idle = mixture == MixtureConfig() and {*weights} == {1.0}
+        field = f"agents.{next(iter(shared), 'KEY.weight')}"
+        require(len(weights) > 1 or is_idle, field, f"must come with several agents. {FIX}")
     for group in schema.groups:
-        is_chosen = objects.get(group) is not None
-        require(is_chosen, group, f"must be chosen; got none. Set {group}=NAME.")
-        objects[group] = registry.configure(group, objects[group], imports)
+        objects[group] = registry.configure(group, objects.get(group, {}), imports)
+    fields = fields_of(schema)
+    for name in objects.keys() - fields.keys():
+        parts = {k: x for k, x in objects.items() if k in fields and k != "agents"}
+        parts |= {field_of(key, of_agents): x for key, x in objects["agents"].items()}
+        raise unknown_field(name, [*fields, *flatten(to_plain(parts))])
     return from_plain(schema, objects, "", imports)
 
 
@@ -445,19 +450,13 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    composed = composed_run(overrides)
+    composed = compose(LearnConfig, overrides)
     return learn_config(composed.values, composed.imports)
-
-
-def composed_run(overrides: Sequence[str]) -> Composed:
-    """What the words of `sejax.run` compose."""
-    _require_overrides(overrides)
-    return compose(LearnConfig, overrides)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    composed = composed_evaluation(overrides)
+    composed = compose(EvaluateConfig, overrides, _learned(read(overrides)))
     require(
         "proxy" in composed.values,
         "proxy",
@@ -467,10 +466,13 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     return _from_plain(EvaluateConfig, composed.values, composed.imports)
 
 
-def composed_evaluation(overrides: Sequence[str]) -> Composed:
-    """What the words of `sejax.evaluate` compose, over what the proxy was learned with."""
-    _require_overrides(overrides)
-    return compose(EvaluateConfig, overrides, _learned(read(overrides)))
+def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
+    """What `--help` says of a command's fields beside these words."""
+    stored = {} if schema.learns else _learned(read(overrides))
+    composed = compose(schema, overrides, stored)
+    values = {"proxy": "RUN_DIR", **composed.values}  # if an evaluation has none yet
+    config = _from_plain(schema, values, composed.imports)
+    return list_fields(config, composed.layers)
 
 
 def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -515,12 +517,3 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     default = agents.default_for(EvaluateConfig.spec_for(given))
     keys = agents_of(given) or {default: default}
     return {"agents": {key: by_name.get(name, {"name": name}) for key, name in keys.items()}}
-
-
-def _require_overrides(overrides: object) -> None:
-    require(
-        isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides),
-        "overrides",
-        f"must be a list of text; got {shortened(repr(overrides))}. Set "
-        'overrides=["env=cartpole"].',
-    )

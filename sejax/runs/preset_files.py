@@ -20,6 +20,7 @@ from sejax.options.plain import flatten, merge, parsed
 PRESETS = Path(__file__).parents[1] / "presets"
 GENERAL = "general"  # the presets of tasks without a file of their own
 ENDING = ".yaml"  # of a preset file
+NONE = ("agent", "agents")  # fields that an older run's config.yaml has as null
 
 
 @functools.cache
@@ -67,27 +68,14 @@ def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
     return general | _all_sections().get(f"{env}-{proxy}", {})
 
 
-def objective_of(preset: str, env: str, proxy: str) -> str | None:
-    """The objective that a preset is for; None if it is for any."""
-    found: str | None = sections_of(env, proxy).get(preset, {}).get("objective", {}).get("name")
-    return found
-
-
-def values_of(preset: str, chosen: Mapping[str, str], agents: Mapping[str, str]) -> dict[str, Any]:
-    """The settings of a preset for these choices, nested plain values.
-
-    Args:
-      preset: its name.
-      chosen: the choice of each group.
-      agents: names of the agents by their keys. What a preset says of other groups beside an agent
-        holds where that is the only one.
+def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
+    """What a preset says of a task and a proxy.
 
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
     if preset not in names():
         raise unknown_name("preset", preset, names())
-    env, proxy = chosen["env"], chosen["proxy"]
     sections = sections_of(env, proxy)
     require(
         preset in sections,
@@ -96,22 +84,31 @@ def values_of(preset: str, chosen: Mapping[str, str], agents: Mapping[str, str])
         f"({listed(list(sections))}); got {preset}, which {listed(tuned(proxy, preset), 60)} have. "
         "Set preset=best.",
     )
-    section = sections[preset]
-    values = {k: x for k, x in section.items() if not k.startswith("with_") and k != "objective"}
+    return sections[preset]
+
+
+def settings_of(
+    section: Mapping[str, Any], chosen: Mapping[str, str], agents: Mapping[str, str]
+) -> dict[str, Any]:
+    """The settings of a preset's section for these choices, nested plain values.
+
+    Args:
+      section: as from `section_of`.
+      chosen: the choice of each group.
+      agents: names of the agents by their keys. What a section says of other groups beside an
+        agent holds where that is the only one.
+    """
     with_agent = section.get("with_agent", {})
     settings = {key: with_agent.get(name, {}) for key, name in agents.items()}
-    layers = [section.get(f"with_{x}", {}).get(chosen[x], {}) for x in ("es", "objective")]
+    layers = [{k: x for k, x in section.items() if not k.startswith("with_")}]
+    layers += [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
     layers += settings.values() if len(agents) == 1 else []
-    values = merge(values, *layers)
-    values.pop("agent", None)
-    own = {key: each.get("agent", {}) for key, each in settings.items()}
-    return {"preset": preset} | values | {"agents": own}
+    shared = {k: x for k, x in merge(*layers).items() if k not in ("agent", "objective")}
+    return shared | {"agents": {key: each.get("agent", {}) for key, each in settings.items()}}
 
 
 def read_file(path: Path) -> dict[str, Any]:
     """The values of a user's file, by their full names; `preset: paper` in it is its base.
-
-    A choice may stand beside its fields as `name`, so that a run's `config.yaml` is such a file.
 
     Raises:
       ConfigError: for a file that cannot be read, or that holds no fields.
@@ -137,11 +134,7 @@ def read_file(path: Path) -> dict[str, Any]:
         "preset",
         f"must name no file in a file; got {shortened(base)}. Write preset: best.",
     )
-    chosen = {x.removesuffix(".name"): values.pop(x) for x in [*values] if x.endswith(".name")}
-    keys = [x.removeprefix("agents.") for x in chosen if x.startswith("agents.")]
-    names = {f"agents.{key}.name": chosen.pop(f"agents.{key}") for key in keys}
-    values |= chosen | names | ({"agents": keys} if keys else {})
-    return {k: v for k, v in values.items() if v is not None or k not in ("agent", "agents")}
+    return {name: x for name, x in values.items() if x is not None or name not in NONE}
 
 
 def file_text(overrides: Iterable[str]) -> str:
