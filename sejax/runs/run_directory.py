@@ -324,7 +324,7 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
             found, expected = there.get(name, "missing"), here.get(name, "missing")
             raise ValueError(f"{name} is {found}, and {expected} in this version")
     arrays = [_as_leaf(tensors[name], leaf) for name, leaf in shapes.items()]
-    state: State = structure.unflatten(arrays)
+    state: State = jax.tree.unflatten(structure, arrays)
     return state
 
 
