@@ -45,7 +45,7 @@ def test_it_writes_an_se_that_says_what_it_is(folder):
         ("test", "ddqn"): 2,
     }
     assert shown.is_distilled and shown.row["learned with"] == "a policy"
-    assert "no agent was trained to learn it" in (folder / "card.md").read_text()
+    assert "| policy_return |" in (folder / "card.md").read_text()
     tested = rows[rows["use"] == "test"].groupby("agent")["test_return"].mean()
     assert {x.agent: x.return_mean for x in shown.evaluations} == pytest.approx(tested.to_dict())
     # Searches, the recorded episodes, and all tests of students.

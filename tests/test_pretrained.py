@@ -25,7 +25,6 @@ from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
 SES = [name for name, proxy in PROXIES.items() if proxy.kind == "se"]
-DISTILLED = [name for name in SES if PROXIES[name].is_distilled]
 ROOT = Path(__file__).parents[1]
 
 
@@ -68,30 +67,24 @@ def test_each_says_what_it_cost(name):
         assert learning.generations >= proxy.generation
 
 
-@pytest.mark.parametrize("name", sorted(set(SES) - set(DISTILLED)))
-def test_the_command_of_each_se_composes_what_its_file_was_learned_with(name):
-    words = shlex.split(PROXIES[name].learning.command)[3:]
-    config, stored = sejax.config(words), sejax.load_proxy(name)
-    assert config.env == type(config.env)(**_fields(stored.config["env"]))
-    assert config.proxy == stored.env.config and config.es == stored.learned_with("es")
-    assert config.training == sejax.training_of(stored)
-
-
-@pytest.mark.parametrize("name", DISTILLED)
-def test_the_command_of_each_distilled_se_is_one_of_its_task_and_students(name):
-    own, config = read(shlex.split(PROXIES[name].learning.command)[3:])
-    stored = sejax.load_proxy(name)
-    assert config.env == type(config.env)(**_fields(stored.config["env"]))
-    assert config.training == sejax.training_of(stored)
-    assert own.search.generations == PROXIES[name].learning.generations
-    assert [x.agent for x in PROXIES[name].on_proxy] == list(stored.learned_agents())
-    assert PROXIES[name].row["learned with"] == "a policy"
-
-
-@pytest.mark.parametrize("name", sorted(set(PROXIES) - set(SES)))
-def test_the_command_of_each_rn_learns_as_long(name):
-    learning = PROXIES[name].learning
-    assert sejax.config(shlex.split(learning.command)[3:]).generations == learning.generations
+@pytest.mark.parametrize("name", PROXIES)
+def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
+    proxy, stored = PROXIES[name], sejax.load_proxy(name)
+    words = shlex.split(proxy.learning.command)[3:]
+    if proxy.is_distilled:
+        own, config = read(words)
+        assert own.search.generations == proxy.learning.generations
+        assert [x.agent for x in proxy.on_proxy] == list(stored.learned_agents())
+        assert proxy.row["learned with"] == "a policy"
+    else:
+        config = sejax.config(words)
+        assert config.generations == proxy.learning.generations
+    fields = {field: value for field, value in stored.config["env"].items() if field != "name"}
+    assert config.env == type(config.env)(**fields)
+    if proxy.kind == "se":
+        assert config.training == sejax.training_of(stored)
+    if proxy.kind == "se" and not proxy.is_distilled:
+        assert config.proxy == stored.env.config and config.es == stored.learned_with("es")
 
 
 def test_the_curves_beside_a_set_tell_what_its_proxies_cost():
@@ -99,10 +92,6 @@ def test_the_curves_beside_a_set_tell_what_its_proxies_cost():
     path, proxy = ROOT / stored, sejax.load_proxy("cartpole-rn")
     learning = ship_proxy.learning_of(path, proxy)["learning"]
     assert learning == dataclasses.asdict(PROXIES["cartpole-rn"].learning)
-
-
-def _fields(values):
-    return {name: value for name, value in values.items() if name != "name"}
 
 
 def test_the_page_is_what_the_tool_makes():

@@ -98,10 +98,9 @@ def _devices(overrides: Sequence[str]) -> int | None:
 def messages() -> Iterator[None]:
     """Within it, bad input and files that fail end the process with one message."""
     try:
-        with runtime.platform_named():
-            yield
+        yield
     except ConfigError as error:
-        fail(str(error), BAD_INPUT)
+        fail(runtime.platform_error() or str(error), BAD_INPUT)
     except KeyboardInterrupt as stop:
         interrupted("Interrupted.", stop)
     except BrokenPipeError:  # the reader has seen enough
@@ -112,6 +111,8 @@ def messages() -> Iterator[None]:
         message = f"A file could not be written or read: {error}. What was written before is whole"
         fail(f"{message}; run the same command again to go on from there.", FAILED)
     except Exception as error:
+        if message := runtime.platform_error():
+            fail(message, BAD_INPUT)
         if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):
             message = f"There is not enough memory: {str(error).splitlines()[0]}"
             fail(f"{message} Smaller networks, buffers or populations need less.", FAILED)

@@ -18,7 +18,7 @@ from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
-STYLE: Any = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
+STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def learning_curve(

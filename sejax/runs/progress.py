@@ -1,19 +1,17 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from sejax.bilevel import Bilevel
 from sejax.options import registry
 from sejax.runs import preset_files
 from sejax.runs.config import LearnConfig
+from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, Reporter
-
-if TYPE_CHECKING:  # the first line is shown before jax is imported
-    from sejax.bilevel import Bilevel
-    from sejax.runs.run_directory import RunDirectory
 
 
 def _live_line(console: Console, text: str, **options: Any) -> Progress:
@@ -115,7 +113,7 @@ class RunProgress(Reporter):
         if not self._console.is_terminal:
             self.say(text)
 
-    def finish(self, directory: "RunDirectory", learner: "Bilevel", best: float) -> None:
+    def finish(self, directory: RunDirectory, learner: Bilevel, best: float) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
         title, verdict = "learned", f"best incumbent score {best:.1f}"

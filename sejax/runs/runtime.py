@@ -5,12 +5,15 @@ import hashlib
 import math
 import os
 import platform
-import sys
-from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
+import jax
+from jax._src import xla_bridge
+
 from sejax.ops import files
-from sejax.options import ConfigError, require
+from sejax.options import require
+from sejax.training import require_modes
 
 CGROUPS = Path("/sys/fs/cgroup")
 _NEVER_SECONDS = 1_000_000
@@ -37,34 +40,20 @@ def _quota(cgroups: Path) -> float:
 
 def is_started() -> bool:
     """Whether jax has its devices already."""
-    if "jax" not in sys.modules:
-        return False
-    from jax._src import xla_bridge
-
     return bool(xla_bridge.backends_are_initialized())
 
 
-@contextlib.contextmanager
-def platform_named() -> Iterator[None]:
-    """Within it, errors that come of a platform that jax lacks name the variable at fault.
-
-    Raises:
-      ConfigError: in the place of such an error.
-    """
+def platform_error() -> str:
+    """The message for a `JAX_PLATFORMS` that jax lacks, of which other code fails; else empty."""
+    asked = os.environ.get("JAX_PLATFORMS")
+    if not asked or is_started():
+        return ""
     try:
-        yield
-    except (ValueError, RuntimeError, AssertionError) as error:  # jax's, or a plugin's that met it
-        asked = os.environ.get("JAX_PLATFORMS")
-        if not asked or "jax" not in sys.modules or is_started():
-            raise
-        import jax
-
-        try:
-            jax.devices()
-        except (RuntimeError, AssertionError):
-            message = f"must name what jax was installed for and finds here; got {asked}."
-            raise ConfigError(f"JAX_PLATFORMS {message} Set JAX_PLATFORMS=cpu.") from error
-        raise
+        jax.devices()
+    except (RuntimeError, AssertionError):
+        must = "must name what jax was installed for and finds here"
+        return f"JAX_PLATFORMS {must}; got {asked}. Set JAX_PLATFORMS=cpu."
+    return ""
 
 
 def configure_xla(num_devices: int | None = None) -> None:
@@ -109,8 +98,6 @@ def take_share_of_gpu(share: float) -> None:
     if is_started():
         return
     if share == 0:
-        import jax
-
         jax.config.update("jax_platforms", "cpu")
     elif share < 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # its older name
         os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")  # 0.75 is usual
@@ -129,10 +116,6 @@ def configure_jax() -> None:
     Raises:
       ConfigError: for a mode of jax in which programs of sejax fail.
     """
-    import jax
-
-    from sejax.training import require_modes
-
     require_modes()
     must = "must be false, as commands compile their programs; got true. Set JAX_DISABLE_JIT=0."
     require(not jax.config.jax_disable_jit, "jax_disable_jit", must)
@@ -171,6 +154,4 @@ def _cpu_lines() -> list[str]:
 
 def versions() -> dict[str, str]:
     """Of the packages that decide a run's numbers."""
-    from importlib.metadata import version
-
     return {name: version(name) for name in ("sejax", "jax", "jaxlib")}
