@@ -143,7 +143,8 @@ class Bilevel:
         scores = self.scoring.judged(outcomes)
         score, by_agent = or_lowest(scores.incumbent_mean), or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
-        after = state.replace(
+        after = dataclasses.replace(
+            state,
             es_state=es_state,
             generation=state.generation + 1,
             incumbent=candidates.incumbent,
