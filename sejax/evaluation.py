@@ -24,12 +24,12 @@ from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import LARGEST, require
+from sejax.options.parts import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import (
     TrainingConfig,
     TrainResult,
     make_trainer,
-    require_training_config,
 )
 
 # --- greedy episodes ------------------------------------------------------------------------------
@@ -236,13 +236,8 @@ def make_evaluator(
 
 def _require_evaluation(task: Task, training: TrainingConfig) -> None:
     """Checks what tests need: a task whose episodes end within a bearable time."""
-    require(
-        isinstance(task, Task),
-        "task",
-        f"must be a sejax.Task; got {type(task).__name__}. Set task=env.task of a proxy, or "
-        "sejax.envs.make(name).",
-    )
-    require_training_config(training)
+    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_part("training", TrainingConfig, training)
     budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
     require(
         task.max_steps <= 1000 * budget,

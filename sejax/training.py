@@ -32,6 +32,7 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.parts import require_part
 from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
@@ -103,20 +104,6 @@ def require_modes() -> None:
         got = getattr(jax.config, mode)
         off = f"Set {mode.upper()}={as_text(allowed[0])}."
         require(got in allowed, mode, f"must be {as_text(allowed[0])}: {reason}; got {got}. {off}")
-
-
-def require_training_config(training: object) -> None:
-    """Checks that it is a `TrainingConfig`.
-
-    Raises:
-      ConfigError: for anything else.
-    """
-    require(
-        isinstance(training, TrainingConfig),
-        "training",
-        f"must be a sejax.TrainingConfig; got {type(training).__name__}. Set "
-        "training=sejax.TrainingConfig(max_episodes=100).",
-    )
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
@@ -275,15 +262,10 @@ def make_trainer(
 
 def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> None:
     """Checks that the arguments are what they are called, in their order."""
-    kind = type(agent).__name__
-    fix = "Set agent=sejax.make_agent(config, task)."
-    require(isinstance(agent, Agent), "agent", f"must be a sejax.Agent; got {kind}. {fix}")
-    require(
-        hasattr(env, "step_env"),
-        "env",
-        f"must be a gymnax environment; got {type(env).__name__}. Set env to the first of the pair "
-        "that sejax.load returns, or to task.env.",
-    )
+    require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
+    fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
+    must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
+    require(hasattr(env, "step_env"), "env", must)
     require_own_steps(env)
     spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
     require(
@@ -292,7 +274,7 @@ def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> 
         f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
         "Set agent=sejax.make_agent(config, task) with that task.",
     )
-    require_training_config(training)
+    require_part("training", TrainingConfig, training)
     require_modes()
 
 

@@ -254,8 +254,8 @@ def _when_full(
         def phase(state: PPOState) -> PPOState:
             # XLA would move what does not depend on the carry out of the loop, into every step.
             inputs = (key, state.params, rollout.rows)
-            own_key, params, rows = jax.lax.optimization_barrier(inputs)
-            return learn(own_key, state.replace(params=params), rollout._replace(rows=rows))
+            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
+            return learn(phase_key, state.replace(params=params), rollout._replace(rows=rows))
 
         return rollout.learn_if_full(phase, state)
 

@@ -59,7 +59,7 @@ class SACConfig(ActorCriticOptions):
         """
         kinds = ("target_entropy", "target_entropy_fraction")
         used, unused = kinds if task.num_actions is None else kinds[::-1]
-        got, default = (getattr(each, unused) for each in (self, type(self)))
+        got, default = (getattr(config, unused) for config in (self, type(self)))
         require(
             got == default,
             f"agent.{unused}",

@@ -76,9 +76,9 @@ class StoaTask(Options):
             raise options.unknown_name("env", self.name, [f"{PREFIX}{x}/ID" for x in SUITES])
         module, maker, (adapter, of) = SUITES[suite]
         try:
-            made = getattr(importlib.import_module(module), maker)(name)
+            theirs = getattr(importlib.import_module(module), maker)(name)
             adapted = getattr(importlib.import_module(f"stoa.env_adapters.{adapter}"), of)
-            args = made if isinstance(made, tuple) else (made,)  # with its params
+            args = theirs if isinstance(theirs, tuple) else (theirs,)  # with its params
             env = adapted(*args)
         except Exception as error:
             is_missing = isinstance(error, ImportError)
@@ -114,12 +114,12 @@ def make_playground(name: str) -> Any:
     return registry.load(name, config_overrides={"impl": "jax"})
 
 
-def _limit(made: tuple[object, ...]) -> int:
+def _limit(theirs: tuple[object, ...]) -> int:
     """The environment's own step limit, of what its suite has made."""
     stated = (
         getattr(x, name, None)
-        for each in made
-        for x in (each, getattr(each, "default_params", None), getattr(each, "_config", None))
+        for part in theirs
+        for x in (part, getattr(part, "default_params", None), getattr(part, "_config", None))
         for name in LIMITS
     )
     return next((int(x) for x in stated if isinstance(x, int)), 1000)
