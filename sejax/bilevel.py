@@ -28,7 +28,7 @@ from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_lowest
 from sejax.options import counts, require
-from sejax.options.parts import Makes, RunConfig, made, require_part
+from sejax.options.parts import Makes, RunConfig, make_part, require_part
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.scoring import GenerationInfo, Scoring
@@ -143,7 +143,8 @@ class Bilevel:
         scores = self.scoring.judged(outcomes)
         score, by_agent = or_lowest(scores.incumbent_mean), or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
-        after = state.replace(
+        after = dataclasses.replace(
+            state,
             es_state=es_state,
             generation=state.generation + 1,
             incumbent=candidates.incumbent,
@@ -240,14 +241,14 @@ def make_bilevel(
       ConfigError: if the parts do not fit each other, or there are not so many devices.
     """
     require_part("task", Task, task)
-    proxy = made("proxy", ProxyEnv, proxy, task)  # type: ignore[type-abstract]
+    proxy = make_part("proxy", ProxyEnv, proxy, task)  # type: ignore[type-abstract]
     must = f"must be one of the task given; got one of {proxy.task.name}. Set task to the proxy's."
     require(proxy.task is task, "proxy", must)
-    objective = made("objective", Objective, objective, task)
+    objective = make_part("objective", Objective, objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
     unravel = flat.inverse_of_flatten(shapes)
-    strategy = made("es", Strategy, es, num_dims)
+    strategy = make_part("es", Strategy, es, num_dims)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,

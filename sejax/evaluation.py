@@ -24,12 +24,12 @@ from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import LARGEST, require
+from sejax.options.parts import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import (
     TrainingConfig,
     TrainResult,
     make_trainer,
-    require_training_config,
 )
 
 # --- greedy episodes ------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ def make_recorder(
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
             after, steps = greedy.step(key_steps, agent_state, state, task.params)
-            return after.replace(active=state.active & after.active), steps
+            return dataclasses.replace(after, active=state.active & after.active), steps
 
         start = greedy.begin(key_reset, True, task.params)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
@@ -223,13 +223,21 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-    require(
-        isinstance(task, Task),
-        "task",
-        f"must be a sejax.Task; got {type(task).__name__}. Set task=env.task of a proxy, or "
-        "sejax.envs.make(name).",
+    _require_evaluation(task, training)
+
+    def make_run(agent: Agent) -> Callable[..., Outcome]:
+        return _evaluation(agent, env, task, training, test_env)
+
+    run = agent.fresh(make_run)
+    return lambda key, env_params, active=True, test_params=None: run(
+        key, env_params, active, test_params
     )
-    require_training_config(training)
+
+
+def _require_evaluation(task: Task, training: TrainingConfig) -> None:
+    """Checks what tests need: a task whose episodes end within a bearable time."""
+    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_part("training", TrainingConfig, training)
     budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
     require(
         task.max_steps <= 1000 * budget,
@@ -239,41 +247,44 @@ def make_evaluator(
         "env.max_steps=N, or Task(max_steps=N).",
     )
 
-    def make_run(agent: Agent) -> Callable[..., Outcome]:
-        test = make_tester(agent, task, training.test_episodes, test_env)
-        train = make_tested_trainer(agent, env, task, training)
 
-        def run(
-            key: Array,
-            env_params: PyTree,
-            active: Array | bool,
-            test_params: PyTree,
-            hparams: Hparams,
-        ) -> Outcome:
-            key_train, key_test = jax.random.split(key)
-            result = train(key_train, env_params, hparams, active)
-            tests = test(key_test, result.agent_state, active, test_params)
-            real_steps = tests.num_steps.sum() + result.eval_steps
-            return Outcome(
-                test_returns=tests.returns,
-                scored_returns=tests.scored,
-                train_steps=result.train_steps,
-                train_episodes=result.episodes,
-                auc=area_under_curve(result, tests.returns.mean()),
-                nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
-            )
+def _evaluation(
+    agent: Agent,
+    env: Environment,
+    task: Task,
+    training: TrainingConfig,
+    test_env: Callable[[Environment], Environment],
+) -> Callable[..., Outcome]:
+    """Builds `run(key, env_params, active, test_params, hparams) -> Outcome`."""
+    test = make_tester(agent, task, training.test_episodes, test_env)
+    train = make_tested_trainer(agent, env, task, training)
 
-        return run
+    def run(
+        key: Array,
+        env_params: PyTree,
+        active: Array | bool,
+        test_params: PyTree,
+        hparams: Hparams,
+    ) -> Outcome:
+        key_train, key_test = jax.random.split(key)
+        result = train(key_train, env_params, hparams, active)
+        tests = test(key_test, result.agent_state, active, test_params)
+        real_steps = tests.num_steps.sum() + result.eval_steps
+        return Outcome(
+            test_returns=tests.returns,
+            scored_returns=tests.scored,
+            train_steps=result.train_steps,
+            train_episodes=result.episodes,
+            auc=area_under_curve(result, tests.returns.mean()),
+            nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
+            real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
+        )
 
-    run = agent.fresh(make_run)
-    return lambda key, env_params, active=True, test_params=None: run(
-        key, env_params, active, test_params
-    )
+    return run
 
 
 def make_tested_trainer(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig, **options: Any
+    agent: Agent, env: Environment, task: Task, training: TrainingConfig, **options: Any
 ) -> Callable[..., TrainResult]:
     """A `make_trainer` whose tests between episodes, if `training` asks for any, are on the task.
 
@@ -333,7 +344,7 @@ def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
 
 def evaluate_agents(
     agent: Agent,
-    env: Any,
+    env: Environment,
     env_params: PyTree,
     task: Task,
     training: TrainingConfig,
@@ -361,7 +372,7 @@ def evaluate_agents(
 @functools.lru_cache(maxsize=64)
 def _evaluation_program(
     agent: Agent,
-    env: Any,
+    env: Environment,
     task: Task,
     training: TrainingConfig,
     num_parallel: int | None,

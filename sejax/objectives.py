@@ -5,6 +5,7 @@ number. `sejax.scoring` applies it to a generation.
 """
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
@@ -87,7 +88,19 @@ class Objective:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaxReward(Options):
+class ObjectiveConfig(Options, ABC):
+    """What the configurations of sejax's objectives share."""
+
+    group: ClassVar[str] = "objective"
+    scores_are_returns: ClassVar[bool] = False
+
+    @abstractmethod
+    def make(self, task: Task) -> Objective:
+        """The objective on a task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaxReward(ObjectiveConfig):
     """The mean test return (SEs), of all of the test episodes or, at first, of other lengths.
 
     Short ones (a Pendulum is rewarded for where it goes at once) or long ones (a car that reaches
@@ -97,7 +110,6 @@ class MaxReward(Options):
     Reinforcement Learning Environments" (2024).
     """
 
-    group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = True
 
     first_eval_steps: int | None = option(
@@ -115,7 +127,6 @@ class MaxReward(Options):
     )
 
     def make(self, task: Task) -> Objective:
-        """The objective on a task."""
         objective = Objective(
             score=lambda outcome: outcome.test_return,
             scores_are_returns=True,
@@ -139,16 +150,13 @@ class MaxReward(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardThreshold(Options):
+class RewardThreshold(ObjectiveConfig):
     r"""How soon an agent solves the task (RNs).
 
     .. math:: -(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))
 
     Source: paper, section "Learning Reward Networks".
     """
-
-    group: ClassVar[str] = "objective"
-    scores_are_returns: ClassVar[bool] = False
 
     unsolved_weight: float = option(
         100.0,
@@ -157,7 +165,7 @@ class RewardThreshold(Options):
     )
 
     def make(self, task: Task) -> Objective:
-        """The objective on a task.
+        """The objective on a task that says when it is solved.
 
         Raises:
           ConfigError: if nobody says when the task is solved.
@@ -181,18 +189,14 @@ class RewardThreshold(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AUC(Options):
+class AUC(ObjectiveConfig):
     """The area under the curve of test returns over training steps, by the number of these (RNs).
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
     Objectives".
     """
 
-    group: ClassVar[str] = "objective"
-    scores_are_returns: ClassVar[bool] = False
-
     def make(self, task: Task) -> Objective:
-        """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc / jnp.maximum(outcome.train_steps, 1),
             needs_tests=True,
@@ -201,7 +205,7 @@ class AUC(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AUCSum(Options):
+class AUCSum(ObjectiveConfig):
     """That area itself, as in the authors' code.
 
     Agents train a number of episodes, so that it rewards short ones where returns are negative, and
@@ -210,11 +214,7 @@ class AUCSum(Options):
     Source: `docs/reference.md` 5.5.
     """
 
-    group: ClassVar[str] = "objective"
-    scores_are_returns: ClassVar[bool] = False
-
     def make(self, task: Task) -> Objective:
-        """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc,
             needs_tests=True,

@@ -4,9 +4,10 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 `docs/reference.md` 3.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from sejax.agents.base import Agent, AgentState, Hparams, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
+from sejax.envs.environment import Environment
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
@@ -30,6 +32,7 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.parts import require_part
 from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
@@ -116,20 +119,6 @@ def require_modes() -> None:
         got = getattr(jax.config, mode)
         off = f"Set {mode.upper()}={as_text(allowed[0])}."
         require(got in allowed, mode, f"must be {as_text(allowed[0])}: {reason}; got {got}. {off}")
-
-
-def require_training_config(training: Any) -> None:
-    """Checks that it is a `TrainingConfig`.
-
-    Raises:
-      ConfigError: for anything else.
-    """
-    require(
-        isinstance(training, TrainingConfig),
-        "training",
-        f"must be a sejax.TrainingConfig; got {type(training).__name__}. Set "
-        "training=sejax.TrainingConfig(max_episodes=100).",
-    )
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
@@ -232,7 +221,7 @@ TestFn = Callable[[Array, AgentState, Array], tuple[Array, Array]]
 
 def make_trainer(
     agent: Agent,
-    env: Any,
+    env: Environment,
     training: TrainingConfig = TrainingConfig(),
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
@@ -283,53 +272,15 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
-
-    def train(
-        key: Array,
-        env_params: PyTree,
-        hparams: Hparams = agent.hparams,
-        active: Array | bool = True,
-    ) -> TrainResult:
-        env_params = loop.prepare(env_params, hparams)
-        key_begin, key_steps = jax.random.split(key)
-        state = loop.begin(key_begin, env_params, hparams, active)
-        stored = tuple(buffer.init() for buffer in loop.buffers(state))
-        no_returns = jnp.full(training.max_episodes, jnp.nan)
-        curve = _Curve(
-            returns=no_returns,
-            ends=jnp.zeros(training.max_episodes, jnp.int32),
-            test_returns=None if loop.test_fn is None else no_returns,
-        )
-        (stored, curve), state = while_any_active(
-            loop.step, (stored, curve), state, (key_steps, env_params)
-        )
-        return TrainResult(
-            agent_state=state.agent_state,
-            train_steps=state.train_steps,
-            episodes=state.episode,
-            returns=curve.returns,
-            test_returns=curve.test_returns,
-            episode_ends=curve.ends,
-            nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
-            eval_steps=state.eval_steps,
-            recorded=stored[1] if recorder is not None else None,
-        )
-
-    return train
+    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
 
 
-def _require_parts(agent: Any, env: Any, training: Any) -> None:
+def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> None:
     """Checks that the arguments are what they are called, in their order."""
-    kind = type(agent).__name__
-    fix = "Set agent=sejax.make_agent(config, task)."
-    require(isinstance(agent, Agent), "agent", f"must be a sejax.Agent; got {kind}. {fix}")
-    require(
-        hasattr(env, "step_env"),
-        "env",
-        f"must be a gymnax environment; got {type(env).__name__}. Set env to the first of the pair "
-        "that sejax.load returns, or to task.env.",
-    )
+    require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
+    fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
+    must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
+    require(hasattr(env, "step_env"), "env", must)
     require_own_steps(env)
     spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
     require(
@@ -338,7 +289,7 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
         f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
         "Set agent=sejax.make_agent(config, task) with that task.",
     )
-    require_training_config(training)
+    require_part("training", TrainingConfig, training)
     require_modes()
 
 
@@ -348,7 +299,7 @@ class _Loop:
     def __init__(
         self,
         agent: Agent,
-        env: Any,
+        env: Environment,
         training: TrainingConfig,
         solved_reward: float,
         test_fn: TestFn | None,
@@ -367,6 +318,41 @@ class _Loop:
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
         self.prepare = lambda params, hparams: prepare(
             env, params, agent.discount(hparams), limit_is_terminal
+        )
+
+    def train(
+        self,
+        key: Array,
+        env_params: PyTree,
+        hparams: Hparams = None,
+        active: Array | bool = True,
+    ) -> TrainResult:
+        """One training; `hparams` None are the agent's own."""
+        hparams = self.agent.hparams if hparams is None else hparams
+        env_params = self.prepare(env_params, hparams)
+        key_begin, key_steps = jax.random.split(key)
+        state = self.begin(key_begin, env_params, hparams, active)
+        stored = tuple(buffer.init() for buffer in self.buffers(state))
+        max_episodes = self.training.max_episodes
+        no_returns = jnp.full(max_episodes, jnp.nan)
+        curve = _Curve(
+            returns=no_returns,
+            ends=jnp.zeros(max_episodes, jnp.int32),
+            test_returns=None if self.test_fn is None else no_returns,
+        )
+        (stored, curve), state = while_any_active(
+            self.step, (stored, curve), state, (key_steps, env_params)
+        )
+        return TrainResult(
+            agent_state=state.agent_state,
+            train_steps=state.train_steps,
+            episodes=state.episode,
+            returns=curve.returns,
+            test_returns=curve.test_returns,
+            episode_ends=curve.ends,
+            nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
+            eval_steps=state.eval_steps,
+            recorded=stored[1] if len(stored) > 1 else None,
         )
 
     def begin(
@@ -426,7 +412,7 @@ class _Loop:
             for buffer, arrays in zip(buffers, stored, strict=True)
         )
 
-        def learn(agent_state: AgentState) -> Any:
+        def learn(agent_state: AgentState) -> AgentState:
             size = self.agent.batch_size(agent_state)
             batch = buffers[0].batch(key_sample, stored[0], state.step + 1, transition, size)
             batch = buffers[0].mask(batch, active) if masked else batch
@@ -436,7 +422,8 @@ class _Loop:
             state.episode >= self.agent.spec.learns_from, learn, lambda s: s, state.agent_state
         )
         train_steps = state.train_steps + info.get("num_steps", 1)
-        state = state.replace(
+        state = dataclasses.replace(
+            state,
             step=state.step + 1,
             train_steps=train_steps,
             episode_return=state.episode_return + reward,
@@ -467,13 +454,16 @@ class _Loop:
         judged = state.episode_return
         if self.test_fn is not None:
             tested, num_steps = self.test_fn(key_test, state.agent_state, finished)
-            state = state.replace(tested=tested, eval_steps=state.eval_steps + num_steps)
+            state = dataclasses.replace(
+                state, tested=tested, eval_steps=state.eval_steps + num_steps
+            )
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])
         stop = self.stops(state, recent)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         num_episodes = state.episode + 1
-        return state.replace(
+        return dataclasses.replace(
+            state,
             active=state.active & ~stop,
             episode=num_episodes,
             episode_return=jnp.float32(0),

@@ -122,13 +122,6 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     assert len(np.unique(data, axis=0)) == len(data)
 
 
-def test_perturbations_are_drawn_anew_in_each_generation(one_device):
-    program, _, ((states, _), _) = one_device
-    first, second = (program.ask(state) for state in states[:2])
-    drawn = [np.asarray(asked.population - asked.incumbent) for asked in (first, second)]
-    assert np.abs(np.corrcoef(*(x.ravel() for x in drawn))[0, 1]) < 0.5
-
-
 def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trainings one by one with tests of one step, and tell."""
     config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)

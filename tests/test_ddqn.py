@@ -18,12 +18,12 @@ from support import (
 )
 
 from sejax.agents.buffers import Transition
-from sejax.agents.dqn import DDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
-GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"
+GOLDEN = Path(__file__).parent / "golden"
 CONFIG = DDQNConfig(
     hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
     learning_rate=0.01, tau=0.1, discount=0.9,
@@ -33,6 +33,20 @@ CASES = {activation: replace(CONFIG, activation=activation) for activation in EX
     "dqn": replace(CONFIG, double=False, loss="huber", target_update_every=2,
                    tau=1.0),
 }  # fmt: skip
+DUELING = DuelingDDQNConfig(
+    hidden_size=5, num_layers=2, feature_dim=4, stream_hidden_size=6, stream_num_layers=1,
+    activation="tanh", batch_size=BATCH, learning_rate=0.01, tau=0.1, discount=0.9,
+)  # fmt: skip
+# Layers in both streams, with a slope of each part; and streams that are their heads alone.
+DUELING_CASES = {
+    "prelu": replace(DUELING, activation="prelu", stream_num_layers=2),
+    "no_streams": replace(DUELING, stream_num_layers=0),
+}
+GOLDEN_UPDATES = [  # made by torch_ddqn.py and torch_dueling.py
+    *(("ddqn", case, config) for case, config in CASES.items()),
+    ("ddqn", "tanh", replace(CONFIG, activation="fast_tanh")),
+    *(("dueling", case, config) for case, config in DUELING_CASES.items()),
+]
 
 
 def random_batch(seed):
@@ -63,18 +77,6 @@ def state_with(agent, params, target_params):
     return state.replace(params=params, target_params=target_params, hparams=hparams)
 
 
-def assert_updates_equal_torchs(golden, case, agent):
-    """Five updates from stored parameters, the first and the last against stored ones."""
-    params = (golden[f"{case}/{name}/0"] for name in ("params", "target_params"))
-    state, update = state_with(agent, *params), jax.jit(agent.update)
-    for number in range(1, 6):
-        state = update(jax.random.key(0), state, random_batch(number))
-        if number in (1, 5):
-            for name in ("params", "target_params"):
-                expected = golden[f"{case}/{name}/{number}"]
-                np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
-
-
 def nested_params(config):
     """Turns the agent's flat parameters into the network's nested ones."""
     init = config.network(NUM_ACTIONS).init
@@ -85,15 +87,25 @@ def nested_params(config):
 # --- updates against torch -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_updates_equal_torchs_on_the_same_batches(case):
-    agent = make_ddqn(CASES[case], OBS_DIM, NUM_ACTIONS)
-    assert_updates_equal_torchs(np.load(GOLDEN), case, agent)  # made by torch_ddqn.py
+@pytest.mark.parametrize(("agent_name", "case", "config"), GOLDEN_UPDATES)
+def test_updates_equal_torchs_on_the_same_batches(agent_name, case, config):
+    golden = np.load(GOLDEN / f"{agent_name}_updates.npz")
+    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+    params = (golden[f"{case}/{name}/0"] for name in ("params", "target_params"))
+    state, update = state_with(agent, *params), jax.jit(agent.update)
+    for number in range(1, 6):
+        state = update(jax.random.key(0), state, random_batch(number))
+        if number in (1, 5):
+            for name in ("params", "target_params"):
+                expected = golden[f"{case}/{name}/{number}"]
+                np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
 
 
-def test_updates_with_the_fast_tanh_equal_torchs_with_the_exact_one():
-    agent = make_ddqn(replace(CONFIG, activation="fast_tanh"), OBS_DIM, NUM_ACTIONS)
-    assert_updates_equal_torchs(np.load(GOLDEN), "tanh", agent)
+def test_a_dueling_agent_trains_alone_on_a_core():
+    # In lockstep its streams' products take longer; DDQN of the same size gains by it.
+    small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
+    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).spec.cpu_num_parallel == 1
+    assert make_ddqn(DDQNConfig(**small), 4, 2).spec.cpu_num_parallel > 1
 
 
 # --- when it learns ------------------------------------------------------------------------------

@@ -134,7 +134,8 @@ def test_a_sac_update_is_sejaxs(examples):
     target_critics = jax.tree.map(lambda x: x + np.float32(0.1), params["critics"])
     state = own_agent.SACState(
         params=params, target_critics=target_critics, opt_state=own_agent.ADAM.init(params),
-        is_warming_up=np.bool_(False), hparams=sejax.agents.traced(own_agent.SAC(**options)),
+        is_warming_up=np.bool_(False),
+        hparams=sejax.agents.traced(own_agent.SAC(**options), own_agent.SACHparams),
     )  # fmt: skip
     rng = np.random.default_rng(0)
     arrays = {

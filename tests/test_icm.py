@@ -164,18 +164,6 @@ def test_the_bonus_shrinks_for_what_is_seen_often_and_is_larger_for_the_unseen(u
     assert strange.mean() > 10 * last.mean()
 
 
-def test_the_inverse_model_learns_which_action_was_taken(updates):
-    # The state moves up with action 1 and down with action 0.
-    batch = random_batch(0, "index")
-    move = np.where(batch.action == 1, 1.0, -1.0).astype(np.float32)
-    batch = batch._replace(next_obs=batch.obs + move)
-    state = updates["index"](KEY, fresh("index", forward_weight=0.0), batch, 200)
-    model, unravel = model_of(CONFIG)
-    one_hot = np.eye(WIDTH)[:, batch.action]
-    logits = model.apply(unravel(state.params), batch.obs, one_hot, batch.next_obs).predicted_action
-    np.testing.assert_array_equal(np.argmax(logits, axis=0), batch.action)
-
-
 def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
     # Discrete TD3 keeps vectors: they go to the forward model as they are.
     batch = random_batch(4, "index")

@@ -72,25 +72,3 @@ def test_an_objective_of_ones_own_has_no_score_for_what_diverged_either():
     objective = Objective(score=lambda outcome: -outcome.train_episodes.astype(jnp.float32))
     got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
     np.testing.assert_array_equal(got, [np.nan, -1.0])
-
-
-@pytest.mark.parametrize(
-    ("config", "needs_tests", "scores_are_returns"),
-    [
-        (MaxReward(), False, True), (RewardThreshold(), False, False),
-        (AUC(), True, False), (AUCSum(), True, False),
-    ],
-    ids=lambda x: type(x).__name__,
-)  # fmt: skip
-def test_an_objective_says_what_it_looks_at(config, needs_tests, scores_are_returns):
-    objective = config.make(task())
-    assert (objective.needs_tests, objective.scores_are_returns) == (
-        needs_tests, scores_are_returns
-    )  # fmt: skip
-    assert config.scores_are_returns == scores_are_returns  # known before it is made
-    assert bool(objective.meaning) != scores_are_returns
-
-
-def test_the_threshold_is_part_of_what_a_score_means():
-    objective = RewardThreshold(unsolved_weight=2.5).make(task(-110.0))
-    assert "2.5" in objective.meaning and "-110" in objective.meaning

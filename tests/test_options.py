@@ -13,7 +13,6 @@ from support import refusal, refused
 
 import sejax
 from sejax import options
-from sejax.agents.base import traced
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import ranges_of
@@ -115,13 +114,6 @@ def test_options_are_frozen_and_given_by_keyword():
 
 
 # --- what is traced, and what is varied ----------------------------------------------------------
-
-
-def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
-    hparams = traced(Config(), hidden_size=None)
-    assert hparams._asdict() == {"weight": 0.5, "share": 0.9, "hidden_size": None}
-    assert type(hparams) is type(traced(Config(weight=2.0), hidden_size=3))  # one type, one program
-    assert type(hparams).__name__ == "ConfigHparams"
 
 
 def test_a_mark_that_nobody_knows_is_a_mistake_of_the_class():

@@ -29,6 +29,7 @@ from sejax.agents.policies import gaussian, softmax
 from sejax.agents.ppo import (
     MIN_STD,
     PPOConfig,
+    PPOHparams,
     make_ppo,
     normalized,
     ppo_loss,
@@ -45,7 +46,7 @@ CONFIG = PPOConfig.paper(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
-HPARAMS = traced(CONFIG)
+HPARAMS = traced(CONFIG, PPOHparams)
 # Three minibatches of four steps, so that each epoch leaves one out.
 GAE = dataclasses.replace(
     CONFIG, advantages="gae", gae_lambda=0.8, rollout_steps=STEPS, num_minibatches=3,

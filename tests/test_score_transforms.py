@@ -81,10 +81,6 @@ def test_weights_worked_by_hand(case):
         )
 
 
-def test_every_transform_is_worked_by_hand():
-    assert set(WORKED["usual"][2]) == set(TRANSFORMS)
-
-
 @pytest.mark.parametrize("name", ["linear", "rank", "nes", "nes_unnormalized"])
 def test_equal_scores_weigh_nothing_where_a_difference_is_needed(name):
     for size in (2, 3, 4, 7, 16, 31):

@@ -339,17 +339,6 @@ def test_what_no_episode_can_be_is_refused(fields, at_fault):
 # --- as a gymnax environment ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", ["cartpole", "acrobot"])
-def test_initial_states_are_the_real_tasks(task):
-    env = make_env(task)
-    keys = jax.random.split(jax.random.key(0), 5)
-    obs, state = jax.vmap(env.reset_env, (0, None))(keys, env.default_params)
-    real, _ = jax.vmap(env.task.env.reset_env, (0, None))(keys, env.task.params)
-    np.testing.assert_array_equal(obs, real)
-    np.testing.assert_array_equal(state.vector, real)
-    np.testing.assert_array_equal(state.time, 0)
-
-
 def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
     env = make_env()
     # d = 0.25 never terminates: the episode runs to the real task's limit.

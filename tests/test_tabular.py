@@ -215,28 +215,6 @@ def test_q_learning_finds_the_shortest_way_along_the_cliff_and_never_undervalues
     np.testing.assert_allclose(values[:, way], np.tile(expected[way], (6, 1)), atol=1e-4)
 
 
-def test_q_learning_of_a_room_ends_at_the_optimal_values():
-    task = envs.make("gridworld_2x2")
-    agent = q_learning(4, 4, learning_rate=1.0, epsilon_init=0.5, epsilon_min=0.5)
-    result, returns = trained(agent, task, num_episodes=200, num_agents=3)
-    # Right, left, down, up in the start, the two corners beside it, and the goal: into the goal 1,
-    # into a corner or a wall beside it -0.01 + 0.9 * 1 = 0.89, the start -0.01 + 0.9 * 0.89.
-    expected = [[0.89, 0.791, 0.89, 0.791], [0.89, 0.791, 1.0, 0.89], [1.0, 0.89, 0.89, 0.791],
-                [0.0] * 4]  # fmt: skip
-    np.testing.assert_allclose(
-        result.agent_state.q_values, np.broadcast_to(expected, (3, 4, 4)), atol=1e-5
-    )
-    np.testing.assert_allclose(returns, 0.99, rtol=1e-6)
-
-
-def test_sarsa_finds_the_shortest_way_when_it_explores_less_and_less():
-    task = envs.make("cliff_walking")
-    config = SARSAConfig(epsilon_init=0.01, epsilon_min=0.0, epsilon_decay=0.9)
-    agent = make_tabular(config, task.num_states, task.num_actions)
-    _, returns = trained(agent, task, num_episodes=300, num_agents=6)
-    assert (returns >= -14.0).all() and (returns == -12.0).sum() >= 4
-
-
 @pytest.mark.parametrize(("make", "worth"), [(q_learning, 1.0), (sarsa, 0.8)])
 def test_sarsa_values_its_own_exploration_and_q_learning_the_best_action(make, worth):
     # 0 -> 1 for nothing; from 1 action 0 earns 1 and action 1 nothing. With epsilon 0.4 the policy

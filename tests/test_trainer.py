@@ -322,20 +322,6 @@ def test_the_world_sees_what_the_agent_means_and_the_memory_what_it_did():
     np.testing.assert_array_equal(tests.num_steps, [3, 3])
 
 
-def test_a_memory_is_asked_when_it_has_the_step_just_made():
-    def counting(example, max_steps):
-        return Buffer(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
-                      batch=lambda key, count, num_steps, *_: (count, num_steps))  # fmt: skip
-
-    def update(key, state, batch):
-        count, num_steps = batch
-        return state.replace(min_discount=jnp.minimum(state.min_discount, count == num_steps))
-
-    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), buffer=counting, update=update)
-    result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([0] * 12, [3] * 12))
-    assert result.agent_state.min_discount == 1
-
-
 def test_an_agent_without_weights_trains_too():
     agent = dataclasses.replace(
         scripted_agent(), init=lambda key, hparams: jnp.int32(0), update=lambda key, state, batch:
@@ -369,24 +355,17 @@ def scripted_lanes():
     return jax.random.split(KEY, 6), params, jnp.arange(6.0), active
 
 
-def assert_lanes_are_single_trainings(train, num_parallel, many):
+@pytest.mark.parametrize(("variant", "shape"), [("plateau", (6,)), ("tested", (2, 3))])
+def test_lanes_equal_single_trainings(trainers, variant, shape):
+    train = in_lanes = trainers[variant]
+    for _ in shape:
+        in_lanes = jax.vmap(in_lanes)
+    lanes = scripted_lanes()
+    many = jax.jit(in_lanes)(*jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), lanes))
+    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[len(shape) :]), many)
     assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
     for i in range(6):
-        alone = jax.tree.map(lambda x, i=i: x[i], num_parallel)
-        assert_same(many, i, train(*alone))
-
-
-def test_lanes_equal_single_trainings(trainers):
-    train, num_parallel = trainers["plateau"], scripted_lanes()
-    assert_lanes_are_single_trainings(train, num_parallel, jax.jit(jax.vmap(train))(*num_parallel))
-
-
-def test_nested_lanes_equal_single_trainings(trainers):
-    num_parallel = scripted_lanes()
-    nested = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), num_parallel)
-    many = jax.jit(jax.vmap(jax.vmap(trainers["tested"])))(*nested)
-    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), many)
-    assert_lanes_are_single_trainings(trainers["tested"], num_parallel, many)
+        assert_same(many, i, train(*jax.tree.map(lambda x, i=i: x[i], lanes)))
 
 
 def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():

@@ -44,11 +44,6 @@ def test_nothing_happens_after_an_episode_has_terminated():
     assert end.position == pytest.approx(0.449 + 0.05, abs=3e-3)  # one step further, not four
 
 
-def test_one_repeat_is_the_world_itself():
-    env = envs.make("cartpole").env
-    assert repeat_actions(env, 1) is env
-
-
 def test_a_trainer_counts_steps_of_the_world():
     agent = scripted_agent()
     agent = dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, action_repeat=3))

@@ -73,7 +73,7 @@ def main():
     arrays = {}
     for case, config in CASES.items():
         arrays |= golden(case, config, nested_params(config))
-    np.savez(GOLDEN, **arrays)
+    np.savez(GOLDEN / "ddqn_updates.npz", **arrays)
 
 
 if __name__ == "__main__":

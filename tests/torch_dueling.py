@@ -1,4 +1,4 @@
-"""The dueling network in torch: makes the golden numbers that `test_dueling.py` compares with.
+"""The dueling network in torch: makes the golden numbers that `test_ddqn.py` compares with.
 
 The rest of the agent is that of `torch_ddqn.py`. Remake them with `python tests/torch_dueling.py`
 where torch is installed.
@@ -6,8 +6,7 @@ where torch is installed.
 
 import numpy as np
 import torch
-from test_ddqn import nested_params
-from test_dueling import CASES, GOLDEN
+from test_ddqn import DUELING_CASES, GOLDEN, nested_params
 from torch_ddqn import TorchDDQN, golden
 from torch_networks import TorchMLP
 
@@ -42,9 +41,9 @@ class TorchDuelingDDQN(TorchDDQN):
 
 def main():
     arrays = {}
-    for case, config in CASES.items():
+    for case, config in DUELING_CASES.items():
         arrays |= golden(case, config, nested_params(config), TorchDuelingDDQN)
-    np.savez(GOLDEN, **arrays)
+    np.savez(GOLDEN / "dueling_updates.npz", **arrays)
 
 
 if __name__ == "__main__":

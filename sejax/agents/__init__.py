@@ -28,6 +28,7 @@ from sejax.agents.buffers import (
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
 from sejax.options import nearest, registry, require, shortened
+from sejax.options.parts import require_part
 
 __all__ = [
     "Agent",
@@ -81,12 +82,8 @@ def make_agent(
       >>> agent.spec.warmup_episodes
       1
     """
-    require(
-        isinstance(task, TaskSpec),
-        "task",
-        f"must be a sejax.Task; got {type(task).__name__}. Set task to env.task, or "
-        "sejax.Task(name=..., env=env).",
-    )
+    fix = "Set task to env.task, or sejax.Task(name=..., env=env)."
+    require_part("task", TaskSpec, task, fix)
     require_fit(config, exploration, task, task.name)
     is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
     return (_make_once if is_key else _make_agent)(config, exploration, task, varied)
@@ -125,13 +122,9 @@ def require_fit(
     Raises:
       ConfigError: if it cannot.
     """
-    for value, kind in ((agent, AgentConfig), (exploration, ExplorationConfig)):
-        require(
-            isinstance(value, kind),
-            kind.group,
-            f"must be a sejax.agents.{kind.__name__}; got {shortened(repr(value))}. Set "
-            f"{kind.group}={_object_of(kind.group, value)}.",
-        )
+    for value, cls in ((agent, AgentConfig), (exploration, ExplorationConfig)):
+        fix = f"Set {cls.group}={_object_of(cls.group, value)}."
+        require_part(cls.group, cls, value, fix)
     agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]

@@ -1,7 +1,5 @@
 """The contract of an agent: a bundle of pure functions over one agent's state."""
 
-import collections
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias, TypeVar
@@ -19,7 +17,8 @@ from sejax.options import Options, counts, one_of, option, require, traced_optio
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
-Hparams: TypeAlias = PyTree  # traced hyperparameters of an agent, floats: see `traced`
+Hparams: TypeAlias = PyTree  # traced hyperparameters of an agent, a named tuple: see `traced`
+Number: TypeAlias = Array | float
 
 
 class ActFn(Protocol):
@@ -291,26 +290,19 @@ class NoExploration(ExplorationConfig):
         return agent
 
 
-def traced(config: Options, **more: float | None) -> Hparams:
-    """A configuration's traced hyperparameters, a named tuple of floats.
+def traced(config: Options, cls: type[T]) -> T:
+    """A configuration's traced hyperparameters.
 
     Args:
       config: a dataclass, some of whose options are `traced`.
-      **more: further numbers, such as the units in use of a network with room for more; None where
-        there is nothing to say.
+      cls: a named tuple whose fields have their names; other fields keep their defaults.
 
     Example:
-      >>> from sejax.agents.tabular import QLearningConfig
-      >>> traced(QLearningConfig()).discount
+      >>> from sejax.agents.tabular import QLearningConfig, TabularHparams
+      >>> traced(QLearningConfig(), TabularHparams).discount
       0.8
     """
-    values = {**traced_options(config), **more}
-    return _hparams_type(f"{type(config).__name__}Hparams", tuple(values))(**values)
-
-
-@functools.cache
-def _hparams_type(name: str, fields: tuple[str, ...]) -> Callable[..., Hparams]:
-    return collections.namedtuple(name, fields)
+    return cls(**traced_options(config))
 
 
 def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:

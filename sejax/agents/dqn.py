@@ -8,7 +8,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, TorsoOptions
+from sejax.agents.base import Agent, AgentSpec, Number, TorsoOptions, traced
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicyOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
@@ -115,8 +115,21 @@ class DQNConfig(DDQNConfig):
     epsilon_min: float = 0.05
 
 
-@struct.dataclass
-class DDQNState:
+class DDQNHparams(NamedTuple):
+    """Traced hyperparameters; of sizes what is in use, None for all."""
+
+    learning_rate: Number
+    tau: Number
+    discount: Number
+    epsilon_init: Number
+    epsilon_min: Number
+    epsilon_decay: Number
+    exploration_steps: Number | None
+    hidden_size: Array | None = None
+    batch_size: Array | None = None
+
+
+class DDQNState(struct.PyTreeNode):
     """One agent."""
 
     params: Float[Array, " num_params"]
@@ -124,7 +137,7 @@ class DDQNState:
     opt_state: optax.OptState
     epsilon: Array
     num_steps: Int[Array, ""]  # agent steps since it first learned
-    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
+    hparams: DDQNHparams
 
 
 def make_ddqn(
@@ -144,7 +157,7 @@ def make_ddqn(
     network = config.with_torso(config.network(num_actions), image)
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
 
-    def init(key: Array, hparams: Hparams) -> DDQNState:
+    def init(key: Array, hparams: DDQNHparams) -> DDQNState:
         params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
@@ -165,6 +178,7 @@ def make_ddqn(
     return off_policy_agent(
         config,
         batches=config.gradient_steps,
+        hparams=traced(config, DDQNHparams),
         init=init,
         begin_episode=begin_episode,
         act=act,
@@ -181,13 +195,14 @@ def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
     return state.replace(epsilon=epsilon)
 
 
-def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
+def linear_epsilon(hparams: DDQNHparams, num_steps: Array) -> Array:
     """The share of random actions `num_steps` after the agent first learned, `[]`.
 
     It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.
 
     Source: Mnih et al. (2015), extended data table 1 (final exploration frame).
     """
+    assert hparams.exploration_steps is not None
     progress = jnp.minimum(num_steps / hparams.exploration_steps, 1.0)
     return hparams.epsilon_init + progress * (hparams.epsilon_min - hparams.epsilon_init)
 

@@ -11,6 +11,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,7 +22,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
+from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, Number, traced
 from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
@@ -87,11 +88,19 @@ class ICMConfig(ExplorationConfig):
         return with_icm(agent, self, task.obs_dim, task.action_dim, is_discrete)
 
 
+class ICMHparams(NamedTuple):
+    """Traced hyperparameters of the module."""
+
+    learning_rate: Number
+    forward_weight: Number
+    reward_scale: Number
+
+
 class CuriousHparams(NamedTuple):
     """Traced hyperparameters of a curious agent: those of the agent inside, and the module's."""
 
     agent: Hparams
-    icm: Hparams
+    icm: ICMHparams
 
 
 class CuriousState(struct.PyTreeNode):
@@ -100,7 +109,7 @@ class CuriousState(struct.PyTreeNode):
     agent_state: AgentState
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    hparams: Hparams  # the module's traced options
+    hparams: ICMHparams
 
 
 class ICMOutputs(NamedTuple):
@@ -167,6 +176,66 @@ class ICM(nn.Module):
         )
 
 
+def _learning_of(
+    model: ICM, unflatten: Callable[[Array], PyTree]
+) -> tuple[
+    Callable[[CuriousState, Transition], CuriousState], Callable[[CuriousState, Transition], Array]
+]:
+    """Builds `train(state, batch) -> state`, a step of Adam, and `bonus(state, batch)`."""
+
+    def outputs(params: PyTree, batch: Transition) -> ICMOutputs:
+        action = as_vectors(batch.action, model.action_width)
+        result: Any = model.apply(params, batch.obs, action, batch.next_obs)
+        return result
+
+    def train(state: CuriousState, batch: Transition) -> CuriousState:
+        def loss_fn(params: PyTree) -> Array:
+            beta = state.hparams.forward_weight
+            return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
+
+        gradient = flat.flatten(jax.grad(loss_fn)(unflatten(state.params)))
+        params, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient, state.hparams.learning_rate
+        )
+        return state.replace(params=params, opt_state=opt_state)
+
+    def bonus(state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
+        error = prediction_error(outputs(unflatten(state.params), batch))
+        return state.hparams.reward_scale * jax.lax.stop_gradient(error)
+
+    return train, bonus
+
+
+def _curious_update(
+    agent: Agent,
+    model: ICM,
+    unflatten: Callable[[Array], PyTree],
+    obs_dim: int,
+    is_discrete: bool,
+) -> Callable[[Array, CuriousState, Transition | Rollout], CuriousState]:
+    """Builds the update of `with_icm`."""
+    train_models, bonus = _learning_of(model, unflatten)
+
+    def update(key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
+        if isinstance(batch, Rollout):
+            return update_from_rollout(key, state, batch)
+        state = train_models(state, batch)
+        batch = batch._replace(reward=batch.reward + bonus(state, batch))
+        return state.replace(agent_state=agent.update(key, state.agent_state, batch))
+
+    def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
+        # The agent's update is inside: its rows with the bonus would else be made in each step.
+        def learn(state: CuriousState) -> CuriousState:
+            batch = rollout.transitions(obs_dim, is_discrete)
+            augmented = rollout.with_bonus(bonus(state, batch))
+            state = train_models(state, batch)
+            return state.replace(agent_state=agent.update(key, state.agent_state, augmented))
+
+        return rollout.learn_if_full(learn, state)
+
+    return update
+
+
 def with_icm(
     agent: Agent, config: ICMConfig, obs_dim: int, action_width: int, is_discrete: bool
 ) -> Agent:
@@ -214,48 +283,11 @@ def with_icm(
             hparams=jax.tree.map(jnp.float32, hparams.icm),
         )
 
-    def outputs(params: PyTree, batch: Transition) -> ICMOutputs:
-        action = as_vectors(batch.action, action_width)
-        made: Any = model.apply(params, batch.obs, action, batch.next_obs)
-        return made
-
-    def train_models(state: CuriousState, batch: Transition) -> CuriousState:
-        def loss_fn(params: PyTree) -> Array:
-            beta = state.hparams.forward_weight
-            return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
-
-        gradient = flat.flatten(jax.grad(loss_fn)(unflatten(state.params)))
-        params, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient, state.hparams.learning_rate
-        )
-        return state.replace(params=params, opt_state=opt_state)
-
-    def bonus(state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
-        error = prediction_error(outputs(unflatten(state.params), batch))
-        return state.hparams.reward_scale * jax.lax.stop_gradient(error)
-
-    def update(key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
-        if isinstance(batch, Rollout):
-            return update_from_rollout(key, state, batch)
-        state = train_models(state, batch)
-        batch = batch._replace(reward=batch.reward + bonus(state, batch))
-        return state.replace(agent_state=agent.update(key, state.agent_state, batch))
-
-    def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
-        # The agent's update is inside: its rows with the bonus would else be made in each step.
-        def learn(state: CuriousState) -> CuriousState:
-            batch = rollout.transitions(obs_dim, is_discrete)
-            augmented = rollout.with_bonus(bonus(state, batch))
-            state = train_models(state, batch)
-            return state.replace(agent_state=agent.update(key, state.agent_state, augmented))
-
-        return rollout.learn_if_full(learn, state)
-
     return _with_bonus(
         agent,
         init=init,
-        update=update,
-        hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
+        update=_curious_update(agent, model, unflatten, obs_dim, is_discrete),
+        hparams=CuriousHparams(agent=agent.hparams, icm=traced(config, ICMHparams)),
         # The module's networks keep a core busy, whatever the agent's.
         spec=dataclasses.replace(agent.spec, cpu_num_parallel=1),
     )
@@ -338,7 +370,7 @@ class CountingHparams(NamedTuple):
     """Traced hyperparameters of a counting agent: those of the agent inside, and the bonus's."""
 
     agent: Hparams
-    reward_scale: Array | float  # beta
+    reward_scale: Number  # beta
 
 
 class CountingState(struct.PyTreeNode):

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
 from sejax.options import Options, one_of, option, require, shortened
+from sejax.options.parts import require_part
 
 COMPARED_BY = ("advantage", "rank")
 
@@ -102,12 +103,7 @@ class Mixture:
         """
         if isinstance(agent, Mixture):
             return agent
-        require(
-            isinstance(agent, Agent),
-            "agent",
-            f"must be a sejax.Agent or a sejax.Mixture; got {shortened(repr(agent))}. Pass an "
-            "object; sejax.config([...]) takes names.",
-        )
+        require_part("agent", Agent, agent)
         return cls(agents=(agent,))
 
     @property

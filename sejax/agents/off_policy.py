@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, AgentState, Hparams, traced
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, AgentState, Hparams, Number
 from sejax.agents.buffers import Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops import flat
 from sejax.ops.networks import MLP
@@ -95,7 +95,7 @@ def off_policy_agent(config: OffPolicyOptions, *, batches: int = 1, **functions:
     Args:
       config: hyperparameters; the agent's state has the traced ones as `hparams`.
       batches: how many batches `update` takes, side by side.
-      **functions: `init`, `act`, `update` and others of `Agent`.
+      **functions: `init`, `act`, `update`, `hparams` and others of `Agent`.
     """
 
     def batch_size(state: AgentState) -> Array | None:
@@ -104,7 +104,6 @@ def off_policy_agent(config: OffPolicyOptions, *, batches: int = 1, **functions:
 
     return Agent(
         buffer=replay_buffer(config.batch_size * batches, config.buffer_size),
-        hparams=traced(config, hidden_size=None, batch_size=None),
         spec=config.spec(),
         discount=lambda hparams: hparams.discount,
         batch_size=batch_size,
@@ -142,7 +141,7 @@ def adam_step(
 
 
 def soft_update(
-    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Array
+    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Number
 ) -> Float[Array, "*params"]:
     """The parameters of a target network that follows the online one with weight `tau`."""
     return tau * online + (1 - tau) * target

@@ -4,6 +4,11 @@ There are two ways to prepare a rollout (`ADVANTAGES`): `gae`, the usual general
 `monte_carlo`, the returns of the paper's code, which learns from the whole rollout in each Adam
 step (`PPOConfig.paper`). All else is the same.
 
+Without exploration the agent takes its most probable action. Differs: the authors also test with
+sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
+MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO has
+no counterpart in their code, nor here.
+
 Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schulman et al.,
 "High-Dimensional Continuous Control Using Generalized Advantage Estimation" (2016); the paper's
 appendix, table of PPO; `docs/reference.md` 4.5.
@@ -20,7 +25,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, TorsoOptions, traced
+from sejax.agents.base import Agent, AgentSpec, Number, TorsoOptions, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
 from sejax.agents.policies import Distribution, gaussian, softmax
 from sejax.envs.base import Task
@@ -134,6 +139,21 @@ class PPOConfig(TorsoOptions):
             return self.rollout_steps
         return self.update_episodes * task_max_steps // self.action_repeat + 1
 
+    def checked_rollout_length(self, task_max_steps: int) -> int:
+        """As `rollout_length`.
+
+        Raises:
+          ConfigError: if a rollout has fewer than two steps for each minibatch.
+        """
+        length = self.rollout_length(task_max_steps)
+        require(
+            self.num_minibatches == 1 or 2 * self.num_minibatches <= length,
+            "agent.num_minibatches",
+            f"must be at most half of the rollout's {length} steps; got "
+            f"{shortened(self.num_minibatches)}. Set agent.num_minibatches={max(1, length // 2)}.",
+        )
+        return length
+
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         """As of any agent; PPO learns once a rollout is full, whose length is by the task."""
         return self.rollout_length(task_max_steps) * self.action_repeat
@@ -150,13 +170,25 @@ class PPOConfig(TorsoOptions):
         return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), adam)
 
 
+class PPOHparams(NamedTuple):
+    """Traced hyperparameters; of `hidden_size` what is in use, None for all."""
+
+    learning_rate: Number
+    discount: Number
+    gae_lambda: Number
+    clip_ratio: Number
+    value_weight: Number
+    entropy_weight: Number
+    hidden_size: Array | None = None
+
+
 class PPOState(struct.PyTreeNode):
     """One agent. `params` are the actor's, the critic's and the std, as one flat vector."""
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
     return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
-    hparams: Hparams  # traced options, and hidden_size in use or None
+    hparams: PPOHparams
 
 
 def make_ppo(
@@ -169,11 +201,6 @@ def make_ppo(
     """Builds the agent for observations `[obs_dim]` and a policy's actions.
 
     `update` learns once the rollout is full and costs next to nothing before, under `vmap` too.
-
-    Without exploration the agent takes its most probable action. Differs: the authors also test
-    with sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
-    MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO
-    has no counterpart in their code, nor here.
 
     Args:
       config: hyperparameters.
@@ -193,17 +220,11 @@ def make_ppo(
       True
     """
     networks = make_networks(config, obs_dim, policy, image)
-    length = config.rollout_length(max_steps)
-    require(
-        config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
-        "agent.num_minibatches",
-        f"must be at most half of the rollout's {length} steps; got "
-        f"{shortened(config.num_minibatches)}. Set agent.num_minibatches={max(1, length // 2)}.",
-    )
+    length = config.checked_rollout_length(max_steps)
     optimizer = config.optimizer()
     learn = make_learning_phase(config, networks, optimizer, obs_dim, policy.std_dim == 0)
 
-    def init(key: Array, hparams: Hparams) -> PPOState:
+    def init(key: Array, hparams: PPOHparams) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
         return PPOState(
             params=params,
@@ -216,25 +237,33 @@ def make_ppo(
         outputs, std = networks.actor(networks.unflatten(state.params), obs)
         return policy.sample(key, outputs, std) if explore else policy.mode(outputs)
 
-    def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        def phase(state: PPOState) -> PPOState:
-            # XLA would move what does not depend on the carry out of the loop, into every step.
-            inputs = (key, state.params, rollout.rows)
-            own_key, params, rows = jax.lax.optimization_barrier(inputs)
-            return learn(own_key, state.replace(params=params), rollout._replace(rows=rows))
-
-        return rollout.learn_if_full(phase, state)
-
     return Agent(
         init=init,
         act=act,
-        update=update,
+        update=_when_full(learn),
         buffer=rollout_buffer(length),
-        hparams=traced(config, hidden_size=None),
+        hparams=traced(config, PPOHparams),
         spec=config.spec(),
         env_action=policy.env_action,
         discount=lambda hparams: hparams.discount,
     )
+
+
+def _when_full(
+    learn: Callable[[Array, PPOState, Rollout], PPOState],
+) -> Callable[[Array, PPOState, Rollout], PPOState]:
+    """Builds an update that is a learning phase where the rollout is full, and else nothing."""
+
+    def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
+        def phase(state: PPOState) -> PPOState:
+            # XLA would move what does not depend on the carry out of the loop, into every step.
+            inputs = (key, state.params, rollout.rows)
+            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
+            return learn(phase_key, state.replace(params=params), rollout._replace(rows=rows))
+
+        return rollout.learn_if_full(phase, state)
+
+    return update
 
 
 class Networks(NamedTuple):
@@ -357,7 +386,7 @@ def make_learning_phase(
     steps. A rollout that these do not divide leaves some steps out of each pass.
     """
 
-    def loss_fn(tree: PyTree, batch: Batch, hp: Hparams) -> Array:
+    def loss_fn(tree: PyTree, batch: Batch, hp: PPOHparams) -> Array:
         log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
@@ -492,7 +521,7 @@ def ppo_loss(
     old_log_prob: Steps,
     advantage: Steps,
     returns: Steps,
-    hp: Hparams,
+    hp: PPOHparams,
 ) -> Float[Array, ""]:
     r"""What a learning phase minimises.
 

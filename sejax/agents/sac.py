@@ -19,7 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, PyTree
 
-from sejax.agents.base import Agent, Hparams
+from sejax.agents.base import Agent, Number, traced
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import ActorCriticOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import select_action
@@ -76,7 +76,7 @@ class SACConfig(ActorCriticOptions):
         """
         kinds = ("target_entropy", "target_entropy_fraction")
         used, unused = kinds if task.num_actions is None else kinds[::-1]
-        got, default = (getattr(each, unused) for each in (self, type(self)))
+        got, default = (getattr(config, unused) for config in (self, type(self)))
         require(
             got == default,
             f"agent.{unused}",
@@ -90,6 +90,20 @@ class SACConfig(ActorCriticOptions):
         return make_sac(self, task.obs_dim, policy)
 
 
+class SACHparams(NamedTuple):
+    """Traced hyperparameters; of sizes what is in use, None for all."""
+
+    learning_rate: Number
+    tau: Number
+    discount: Number
+    alpha: Number | None
+    init_alpha: Number
+    target_entropy: Number
+    target_entropy_fraction: Number
+    hidden_size: Array | None = None
+    batch_size: Array | None = None
+
+
 class SACState(struct.PyTreeNode):
     """One agent. Parameters are flat: the actor's, both critics' and log alpha in one vector."""
 
@@ -97,7 +111,7 @@ class SACState(struct.PyTreeNode):
     target_critics: Float[Array, " num_critic_params"]
     opt_state: optax.OptState
     is_warming_up: Bool[Array, ""]
-    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
+    hparams: SACHparams
 
 
 class LearningNoise(NamedTuple):
@@ -138,7 +152,7 @@ class Policy:
     num_outputs: int
     critic_inputs: int
     critic_outputs: int
-    target_entropy: Callable[[Hparams], Array]
+    target_entropy: Callable[[SACHparams], Number]
     draw: Callable[[Array, int], LearningNoise]
     sample: Callable[[Array, Array, Array], Array]
     best: Callable[[Array], Array]
@@ -159,7 +173,7 @@ def make_sac(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy)
     learn = make_learning_step(networks, policy)
 
-    def init(key: Array, hparams: Hparams) -> SACState:
+    def init(key: Array, hparams: SACHparams) -> SACState:
         params = networks.init(key, hparams)
         return SACState(
             params=params,
@@ -180,6 +194,7 @@ def make_sac(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
 
     return off_policy_agent(
         config,
+        hparams=traced(config, SACHparams),
         init=init,
         begin_episode=config.begin_episode,
         act=act,
@@ -211,7 +226,7 @@ class Networks(NamedTuple):
       critics: `(Params.critics, inputs) -> outputs`, `[2, critic_outputs, batch]`.
     """
 
-    init: Callable[[Array, Hparams], Array]
+    init: Callable[[Array, SACHparams], Array]
     unflatten: Callable[[Array], Params]
     critics_of: Callable[[Array], Array]
     unflatten_critics: Callable[[Array], PyTree]
@@ -234,7 +249,7 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
             log_alpha=jnp.zeros(()),
         )
 
-    def init(key: Array, hparams: Hparams) -> Array:
+    def init(key: Array, hparams: SACHparams) -> Array:
         params = init_params(key, hparams.hidden_size)
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
@@ -273,28 +288,7 @@ def make_learning_step(
     Source: Haarnoja et al. (2018), equations 5, 7 and 18; Christodoulou (2019), equations 10 to 12.
     """
 
-    def losses(
-        params: Params, target_critics: PyTree, hp: Hparams, batch: Transition, noise: LearningNoise
-    ) -> Float[Array, " batch"]:
-        fixed = jax.lax.stop_gradient(params)
-        online, online_fixed, target = (
-            functools.partial(networks.critics, critics)
-            for critics in (params.critics, fixed.critics, target_critics)
-        )
-        alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
-        next_q, next_entropy = policy.expected(
-            target, batch.next_obs, networks.actor(fixed, batch.next_obs), noise.next_action
-        )
-        targets = batch.reward + hp.discount * batch.discount * (next_q + alpha * next_entropy)
-        errors = policy.q_values(online, batch.obs, batch.action) - targets
-        q_value, entropy = policy.expected(
-            online_fixed, batch.obs, networks.actor(params, batch.obs), noise.action
-        )
-        losses = 0.5 * jnp.sum(errors**2, axis=0) - (q_value + alpha * entropy)
-        if hp.alpha is None:
-            excess = jax.lax.stop_gradient(entropy) - policy.target_entropy(hp)
-            losses = losses + params.log_alpha * excess
-        return losses
+    losses = functools.partial(losses_of, networks, policy)
 
     def learn(state: SACState, batch: Transition, noise: LearningNoise) -> SACState:
         hp = state.hparams
@@ -315,6 +309,37 @@ def make_learning_step(
         )
 
     return learn
+
+
+def losses_of(
+    networks: Networks,
+    policy: Policy,
+    params: Params,
+    target_critics: PyTree,
+    hp: SACHparams,
+    batch: Transition,
+    noise: LearningNoise,
+) -> Float[Array, " batch"]:
+    """All three losses of a batch's columns; see `make_learning_step`."""
+    fixed = jax.lax.stop_gradient(params)
+    online, online_fixed, target = (
+        functools.partial(networks.critics, critics)
+        for critics in (params.critics, fixed.critics, target_critics)
+    )
+    alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
+    next_q, next_entropy = policy.expected(
+        target, batch.next_obs, networks.actor(fixed, batch.next_obs), noise.next_action
+    )
+    targets = batch.reward + hp.discount * batch.discount * (next_q + alpha * next_entropy)
+    errors = policy.q_values(online, batch.obs, batch.action) - targets
+    q_value, entropy = policy.expected(
+        online_fixed, batch.obs, networks.actor(params, batch.obs), noise.action
+    )
+    losses = 0.5 * jnp.sum(errors**2, axis=0) - (q_value + alpha * entropy)
+    if hp.alpha is None:
+        excess = jax.lax.stop_gradient(entropy) - policy.target_entropy(hp)
+        losses = losses + params.log_alpha * excess
+    return losses
 
 
 def lesser(q_values: Float[Array, "2 *values"]) -> Float[Array, "*values"]:

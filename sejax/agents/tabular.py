@@ -7,14 +7,14 @@ Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, traced
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Number, traced
 from sejax.agents.buffers import Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
 from sejax.envs.base import Task
@@ -77,13 +77,22 @@ class SARSAConfig(QLearningConfig):
         return jnp.sum(jnp.where(jnp.arange(q_row.size) == action, q_row, 0.0))
 
 
-@struct.dataclass
-class TabularState:
+class TabularHparams(NamedTuple):
+    """Traced hyperparameters."""
+
+    learning_rate: Number
+    discount: Number
+    epsilon_init: Number
+    epsilon_min: Number
+    epsilon_decay: Number
+
+
+class TabularState(struct.PyTreeNode):
     """One agent."""
 
     q_values: Float[Array, "num_states num_actions"]
     epsilon: Array
-    hparams: Hparams  # traced options
+    hparams: TabularHparams
 
 
 def make_tabular(config: QLearningConfig, num_states: int, num_actions: int) -> Agent:
@@ -96,7 +105,7 @@ def make_tabular(config: QLearningConfig, num_states: int, num_actions: int) -> 
       0
     """
 
-    def init(key: Array, hparams: Hparams) -> TabularState:
+    def init(key: Array, hparams: TabularHparams) -> TabularState:
         hparams = jax.tree.map(jnp.float32, hparams)
         return TabularState(
             q_values=jnp.zeros((num_states, num_actions), jnp.float32),
@@ -129,7 +138,7 @@ def make_tabular(config: QLearningConfig, num_states: int, num_actions: int) -> 
         act=act,
         update=update,
         buffer=no_buffer(),
-        hparams=traced(config),
+        hparams=traced(config, TabularHparams),
         spec=config.spec(),
         discount=lambda hparams: hparams.discount,
     )

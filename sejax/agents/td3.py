@@ -17,7 +17,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.base import Agent, Hparams
+from sejax.agents.base import Agent, Number, traced
 from sejax.agents.buffers import Transition
 from sejax.agents.networks import flat_network
 from sejax.agents.off_policy import ActorCriticOptions, adam_step, off_policy_agent, soft_update
@@ -97,6 +97,21 @@ class DiscreteTD3Config(TD3Config):
         return super().mlp(num_outputs).clone(layer_norm=self.layer_norm, may_narrow=True)
 
 
+class TD3Hparams(NamedTuple):
+    """Traced hyperparameters; of sizes what is in use, None for all."""
+
+    learning_rate: Number
+    tau: Number
+    discount: Number
+    action_noise_std: Number
+    target_noise_std: Number
+    target_noise_clip: Number
+    temperature: Number | None = None  # of discrete actions, as the next
+    final_temperature: Number | None = None
+    hidden_size: Array | None = None
+    batch_size: Array | None = None
+
+
 class TD3State(struct.PyTreeNode):
     """One agent. Parameters are flat; the two critics' are the rows of one array."""
 
@@ -108,7 +123,7 @@ class TD3State(struct.PyTreeNode):
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
     is_warming_up: Bool[Array, ""]
-    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
+    hparams: TD3Hparams
 
 
 class LearningNoise(NamedTuple):
@@ -162,7 +177,7 @@ def make_td3(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy.action_dim)
     learn = make_learning_step(config, networks, policy)
 
-    def init(key: Array, hparams: Hparams) -> TD3State:
+    def init(key: Array, hparams: TD3Hparams) -> TD3State:
         actor, critics = networks.init(key, hparams.hidden_size)
         return TD3State(
             actor=actor,
@@ -193,6 +208,7 @@ def make_td3(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
 
     return off_policy_agent(
         config,
+        hparams=traced(config, TD3Hparams),
         init=init,
         begin_episode=config.begin_episode,
         act=act,
@@ -402,7 +418,7 @@ def gumbel_softmax(
     return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
 
 
-def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -> Array:
+def annealed_temperature(hparams: TD3Hparams, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
@@ -411,6 +427,7 @@ def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -
     Source: `docs/reference.md` 4.4.
     """
     progress = jnp.minimum(num_updates / num_steps, 1.0)
+    assert hparams.temperature is not None and hparams.final_temperature is not None
     factor = 1 + progress * (hparams.final_temperature - 1)
     return jnp.maximum(hparams.temperature * factor, _MIN_TEMPERATURE)
 

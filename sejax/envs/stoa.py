@@ -10,15 +10,19 @@ extra `stoa`. Two players, or several actions at once, do not fit an agent of se
 import importlib
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, PyTree
 
 from sejax import options
 from sejax.envs.base import Task
-from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
+from sejax.envs.spec import Box, Discrete, Space, TaskSpec
 from sejax.options import Options, counts, option, require
-
-if TYPE_CHECKING:
-    from sejax.envs.environment import Environment
 
 PREFIX = "stoa/"
 LIMITS = ("max_steps", "max_timesteps", "time_limit", "episode_length")  # as suites call it
@@ -75,9 +79,9 @@ class StoaTask(Options):
             raise options.unknown_name("env", self.name, [f"{PREFIX}{x}/ID" for x in SUITES])
         module, maker, (adapter, of) = SUITES[suite]
         try:
-            made = getattr(importlib.import_module(module), maker)(name)
+            theirs = getattr(importlib.import_module(module), maker)(name)
             adapted = getattr(importlib.import_module(f"stoa.env_adapters.{adapter}"), of)
-            args = made if isinstance(made, tuple) else (made,)  # with its params
+            args = theirs if isinstance(theirs, tuple) else (theirs,)  # with its params
             env = adapted(*args)
         except Exception as error:
             is_missing = isinstance(error, ImportError)
@@ -90,7 +94,7 @@ class StoaTask(Options):
             ) from error
         return Task(
             name=self.name,
-            env=_environment(env, self.max_steps or _limit(args)),
+            env=StoaEnv(env, self.max_steps or _limit(args)),
             solved_reward=math.inf if self.solved_reward is None else self.solved_reward,
         )
 
@@ -113,82 +117,90 @@ def make_playground(name: str) -> Any:
     return registry.load(name, config_overrides={"impl": "jax"})
 
 
-def _limit(made: tuple[Any, ...]) -> int:
+def _limit(theirs: tuple[object, ...]) -> int:
     """The environment's own step limit, of what its suite has made."""
     stated = (
         getattr(x, name, None)
-        for each in made
-        for x in (each, getattr(each, "default_params", None), getattr(each, "_config", None))
+        for part in theirs
+        for x in (part, getattr(part, "default_params", None), getattr(part, "_config", None))
         for name in LIMITS
     )
     return next((int(x) for x in stated if isinstance(x, int)), 1000)
 
 
-def _environment(env: Any, max_steps: int) -> "Environment[Any, Any]":
-    """A stoa environment in sejax's own interface."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-    from flax import struct
-    from jaxtyping import Array
+@struct.dataclass
+class StoaState(EnvState):
+    inner: PyTree  # the suite's
+    truncated: Array
 
-    from sejax.envs.environment import Environment, EnvState
 
-    @struct.dataclass
-    class StoaState(EnvState):
-        inner: Any
-        truncated: Array
+class StoaEnv(Environment[StoaState, EnvParams]):
+    """A stoa environment in sejax's own interface.
 
-    def observed(step: Any) -> Array:
-        leaves = jax.tree.leaves(step.observation)
-        return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves])
+    Args:
+      env: the adapter's, of one of the suites.
+      max_steps: step limit of an episode.
 
-    class StoaEnv(Environment[Any, Any]):
-        def reset_env(self, key: Array, params: Any) -> tuple[Array, StoaState]:
-            inner, step = env.reset(key)
-            state = StoaState(time=jnp.int32(0), inner=inner, truncated=jnp.bool_(False))
-            return observed(step), state
+    Raises:
+      ConfigError: for several players, several actions at once, or actions without bounds.
+    """
 
-        def step_env(self, key: Array, state: Any, action: Array, params: Any) -> Any:
-            inner, step = env.step(state.inner, as_theirs(action))
-            # jumanji's last steps all come as terminated; the discount tells which are not.
-            terminated = step.last() & (step.discount == 0)
-            truncated = step.last() & ~terminated
-            after = StoaState(time=state.time + 1, inner=inner, truncated=truncated)
-            info = {"discount": jnp.float32(step.discount)}
-            return observed(step), after, jnp.float32(step.reward), terminated, info
+    def __init__(self, env: Any, max_steps: int):
+        self._env = env
+        space = env.action_space()
 
-        def is_truncated(self, state: Any, params: Any) -> Array:
-            return jnp.asarray(state.truncated | (state.time >= params.max_steps_in_episode))
+        def first() -> tuple[Array, Array]:
+            state, step = env.reset(jax.random.key(0))
+            reward = env.step(state, jnp.zeros(space.shape, space.dtype))[1].reward
+            return _vector(step.observation), reward
 
-    space = env.action_space()
-    _, first = jax.eval_shape(env.reset, jax.random.key(0))
-    size = sum(x.size for x in jax.tree.leaves(first.observation))
+        obs, reward = jax.eval_shape(first)
+        must = f"must have one player; got {reward.size} of them. Set another one."
+        require(reward.size == 1, "env", must)
+        action, self._bounds = _action_space(space)
+        observation = Box.symmetric(*[math.inf] * obs.size)
+        super().__init__(TaskSpec(observation=observation, action=action, max_steps=max_steps))
+
+    def reset_env(self, key: Array, params: EnvParams) -> tuple[Array, StoaState]:
+        inner, step = self._env.reset(key)
+        state = StoaState(time=jnp.int32(0), inner=inner, truncated=jnp.bool_(False))
+        return _vector(step.observation), state
+
+    def step_env(
+        self, key: Array, state: StoaState, action: Array, params: EnvParams
+    ) -> Step[StoaState]:
+        if self._bounds is not None:
+            low, high = self._bounds
+            action = low + (action.reshape(low.shape) + 1) / 2 * (high - low)
+        inner, step = self._env.step(state.inner, action)
+        # jumanji's last steps all come as terminated; the discount tells which are not.
+        terminated = step.last() & (step.discount == 0)
+        truncated = step.last() & ~terminated
+        after = StoaState(time=state.time + 1, inner=inner, truncated=truncated)
+        info = {"discount": jnp.float32(step.discount)}
+        return _vector(step.observation), after, jnp.float32(step.reward), terminated, info
+
+    def is_truncated(self, state: StoaState, params: EnvParams) -> Array:
+        return jnp.asarray(state.truncated | (state.time >= params.max_steps_in_episode))
+
+
+def _vector(observation: PyTree) -> Array:
+    leaves = jax.tree.leaves(observation)
+    return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves])
+
+
+def _action_space(space: Any) -> tuple[Space, tuple[np.ndarray, np.ndarray] | None]:
+    """The space as agents act, [-1, 1] for actions of any bounds, and these bounds."""
     if hasattr(space, "num_values"):
-        require(
-            np.ndim(space.num_values) == 0,
-            "env",
-            f"must have one action at a time; got {space.num_values}. Set another one.",
-        )
-        action: Any = Discrete(int(space.num_values))
-        as_theirs = lambda action: action  # noqa: E731
-    else:
-        low, high = (
-            np.broadcast_to(x, space.shape).astype("f4") for x in (space.minimum, space.maximum)
-        )
-        require(
-            np.isfinite([low, high]).all() and (low < high).all(),
-            "env",
-            f"must have bounded actions; got {space.minimum} to {space.maximum}. Set another one.",
-        )
-        action = Box.symmetric(*[1.0] * low.size)  # as agents act, of any bounds
-        as_theirs = lambda action: low + (action.reshape(low.shape) + 1) / 2 * (high - low)  # noqa: E731
-    observation = Box.symmetric(*[math.inf] * size)
-
-    def first_reward(key: Array) -> Array:
-        return env.step(env.reset(key)[0], jnp.zeros(space.shape, space.dtype))[1].reward
-
-    players = jax.eval_shape(first_reward, jax.random.key(0)).size
-    must = f"must have one player; got {players} of them. Set another one."
-    require(players == 1, "env", must)
-    return StoaEnv(TaskSpec(observation=observation, action=action, max_steps=max_steps))
+        must = f"must have one action at a time; got {space.num_values}. Set another one."
+        require(np.ndim(space.num_values) == 0, "env", must)
+        return Discrete(int(space.num_values)), None
+    low, high = (
+        np.broadcast_to(x, space.shape).astype("f4") for x in (space.minimum, space.maximum)
+    )
+    require(
+        np.isfinite([low, high]).all() and (low < high).all(),
+        "env",
+        f"must have bounded actions; got {space.minimum} to {space.maximum}. Set another one.",
+    )
+    return Box.symmetric(*[1.0] * low.size), (low, high)

@@ -3,6 +3,7 @@
 Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/reference.md` 2.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -125,7 +126,8 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
         step = state.step_size * weights @ noise
         if config.update_rule == "paper":
             step = step / (num_noises * state.noise_std)
-        return state.replace(
+        return dataclasses.replace(
+            state,
             mean=(1 - config.weight_decay) * state.mean + step,
             noise_std=state.noise_std * config.noise_std_decay,
             step_size=state.step_size * config.step_size_decay,

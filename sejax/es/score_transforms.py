@@ -135,11 +135,11 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
     """
     if isinstance(choice, str) and choice in TRANSFORMS:
         return TRANSFORMS[choice]
-    own = registry.imported(FIELD, choice) if isinstance(choice, str) else choice
+    function = registry.imported(FIELD, choice) if isinstance(choice, str) else choice
     for scores in (np.arange(pop, dtype=np.float32), np.zeros(pop, np.float32)):
         try:
             with jax.ensure_compile_time_eval():
-                weights = np.asarray(jax.jit(own)(scores), float)
+                weights = np.asarray(jax.jit(function)(scores), float)
         except Exception as error:
             must = f"{FIELD} must be a function of scores [pop] that jax can trace"
             raise ConfigError(f"{must}; {choice} raised {told(error)}.", FIELD) from error
@@ -152,7 +152,7 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         )
 
     def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-        weights = jnp.asarray(own(_floor_nonfinite(scores)), jnp.float32)
+        weights = jnp.asarray(function(_floor_nonfinite(scores)), jnp.float32)
         return jnp.where(jnp.isfinite(weights) & jnp.isfinite(scores).any(), weights, 0.0)
 
     return transform

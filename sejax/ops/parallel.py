@@ -115,7 +115,7 @@ def spread_groups_over_devices(
     widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 
     def map_groups(groups: Sequence[tuple[PyTree, ...]]) -> list[PyTree]:
-        return [map_in_batches(*each) for each in zip(fns, widths, groups, strict=True)]
+        return [map_in_batches(*group) for group in zip(fns, widths, groups, strict=True)]
 
     if mesh.size == 1:
         return map_groups
@@ -154,8 +154,8 @@ def map_in_batches(
     # The last batch is filled up with copies: products of another width round otherwise, and a
     # result must not depend on how many elements a device has.
     num_batches = -(-size // width)
-    places = np.arange(num_batches * width) % size
-    batches = jax.tree.map(lambda x: x[places].reshape(-1, width, *x.shape[1:]), args)
+    indices = np.arange(num_batches * width) % size
+    batches = jax.tree.map(lambda x: x[indices].reshape(-1, width, *x.shape[1:]), args)
     out = jax.lax.map(jax.vmap(lambda args: fn(*args)), batches)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
 

@@ -25,7 +25,7 @@ class RunConfig(Protocol):
     def parts(self) -> dict[str, Any]: ...
 
 
-def made(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
+def make_part(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
     """The part itself.
 
     Args:
@@ -42,13 +42,17 @@ def made(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
     return require_part(group, cls, part)
 
 
-def require_part(group: str, cls: type[T], part: object) -> T:
+def require_part(
+    group: str,
+    cls: type[T],
+    part: object,
+    fix: str = "Pass an object; sejax.config([...]) takes names.",
+) -> T:
     """The part, if it is one of this class.
 
     Raises:
       ConfigError: for anything else.
     """
-    fix = "Pass an object; sejax.config([...]) takes names."
-    must = f"must be a sejax.{cls.__name__}; got {shortened(repr(part))}. {fix}"
-    require(isinstance(part, cls), group, must)
+    got = shortened(repr(part))
+    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; got {got}. {fix}")
     return cast(T, part)
