@@ -29,20 +29,20 @@ class NESConfig(StrategyOptions):
     # Agents on the incumbent; null: one for each perturbation, as in the paper.
     num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE), traced=True)
+    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE))
     # factor on sigma after each generation
-    noise_std_decay: float = option(0.97, shrinks(), traced=True)
+    noise_std_decay: float = option(0.97, shrinks())
     # alpha: step size of the update
-    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE), traced=True)
+    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE))
     # factor on alpha after each generation
-    step_size_decay: float = option(1.0, shrinks(), traced=True)
+    step_size_decay: float = option(1.0, shrinks())
     mirrored: bool = True  # each perturbation is tried as +eps and -eps and keeps its better sign
     # A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.
     score_transform: str | OwnTransform = option("all_better_2", require_transform)  # noqa: RUF009
     # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
     update_rule: str = option("authors", one_of(UPDATE_RULES))
     # psi shrinks by this before each update
-    weight_decay: float = option(0.0, fraction(), traced=True)
+    weight_decay: float = option(0.0, fraction())
 
     def make(self, num_dims: int) -> Strategy:
         """NES over vectors of `num_dims` numbers."""
