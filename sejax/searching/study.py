@@ -26,7 +26,7 @@ from sejax.searching.config import REDUCTION_FACTOR, Search
 from sejax.searching.trials import Progress
 
 STORED = "sejax"  # the study's attribute that holds what is searched
-ATTEMPTS = 4  # at a trial whose workers are lost
+ATTEMPTS = 10  # at a trial whose workers are lost
 LONGEST_WAIT_S = 3600  # for another worker's write to the database
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 ATTRIBUTES = ("number", "state", "value", "user_attrs")  # of a trial, in tables
@@ -35,15 +35,17 @@ HOW = ("seed", "devices", "num_parallel", "tracker")  # fields of how trials ran
 
 
 @contextlib.contextmanager
-def usable(search: Search) -> Iterator[None]:
+def usable(search: Search, *more: type[Exception]) -> Iterator[None]:
     """Within it, trouble with the database is told in one line.
 
     Raises:
-      ConfigError: in the place of Optuna's errors and its database's.
+      ConfigError: in the place of Optuna's errors and its database's, and of `more`.
     """
     try:
         yield
-    except (optuna.exceptions.OptunaError, SQLAlchemyError) as error:
+    except ConfigError:
+        raise
+    except (optuna.exceptions.OptunaError, SQLAlchemyError, *more) as error:
         raise ConfigError(
             f"search_dir must hold a database that can be used; got {search.folder / 'study.db'} "
             f"({told(error.__cause__ or error)}). Set search_dir=FOLDER.",
@@ -62,7 +64,7 @@ def open_study(search: Search) -> optuna.Study:
     config, current = search.config, search.current()
     require_writable("search_dir", search.folder)
     (search.folder / "trials").mkdir(parents=True, exist_ok=True)
-    with _lock(search, "study"):
+    with _lock(search, "study"), usable(search, KeyError, TypeError, ValueError):
         study = optuna.create_study(
             study_name=search.study,
             storage=optuna.storages.RDBStorage(
@@ -75,6 +77,7 @@ def open_study(search: Search) -> optuna.Study:
             direction="maximize",
             load_if_exists=True,
         )
+        study.get_trials(deepcopy=False)  # reads all of it
         if STORED in study.user_attrs:
             search.require_same(study.user_attrs[STORED])
             return study
@@ -108,6 +111,7 @@ def work(study: optuna.Study, search: Search) -> None:
 def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) -> Trial | None:
     """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
     known = study.get_trials(deepcopy=False)
+    space = {x.parameter: x.distribution for x in search.space.values()}
     for frozen in known:
         if frozen.state != TrialState.RUNNING:
             continue
@@ -116,17 +120,28 @@ def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) ->
         except filelock.Timeout:  # its worker is there
             continue
         attempts = frozen.user_attrs.get("attempts", 1)
-        if attempts < ATTEMPTS and len(frozen.params) == len(search.space):
+        if attempts < ATTEMPTS:
             trial = Trial(study, frozen._trial_id)
             trial.set_user_attr("attempts", attempts + 1)
+            for name, distribution in space.items():  # of which it may lack some
+                trial._suggest(name, distribution)
             return trial
         study.tell(frozen.number, state=TrialState.FAIL)
     if sum(trial.state in ENDED for trial in known) >= search.config.trials:
         return None
-    # A search that was stopped draws the same.
-    seed = np.random.SeedSequence([search.plain["seed"], len(known)]).generate_state(1)[0]
-    study.sampler = optuna.samplers.TPESampler(seed=int(seed))
-    trial = study.ask({x.parameter: x.distribution for x in search.space.values()})
+    if not any(trial.state == TrialState.WAITING for trial in known):
+        # Drawn at once: whoever is killed meanwhile leaves no half of it, and draws the same again.
+        seed = np.random.SeedSequence([search.plain["seed"], len(known)]).generate_state(1)[0]
+        sampler = optuna.samplers.TPESampler(seed=int(seed))
+        draft = optuna.create_study(
+            study_name=study.study_name,
+            sampler=sampler,
+            pruner=study.pruner,
+            direction="maximize",
+        )
+        draft.add_trials(known)
+        study.enqueue_trial(draft.ask(space).params)
+    trial = study.ask(space)
     held.enter_context(_lock(search, _name(trial.number)))
     return trial
 
@@ -144,11 +159,11 @@ def _computed(trial: Trial, search: Search) -> str:
         study.tell(trial, state=TrialState.PRUNED)
         return f"refused: {error}"
     num_reported = len(study.get_trials(deepcopy=False)[trial.number].intermediate_values)
-    for rung in search.config.rungs:
+    for rung in (rung for rung in search.config.rungs if rung >= num_reported):
         progress = run(rung)
         for step in range(num_reported + 1, rung + 1):
             trial.report(float(progress.scores[step - 1]), step)
-        num_reported = max(num_reported, rung)
+        num_reported = rung
         if rung < last and not progress.is_over and trial.should_prune():
             break
     trial.set_user_attr("generations", progress.generations)
