@@ -60,11 +60,9 @@ class LocalConfig(Options):
     group: ClassVar[str] = "machines"
     is_elsewhere: ClassVar[bool] = False
 
-    def make(
-        self, config: LearnConfig, say: Callable[[str], None]
-    ) -> contextlib.AbstractContextManager["Chunks"]:
+    def make(self, config: LearnConfig) -> contextlib.AbstractContextManager["Chunks"]:
         """The compiled generations of a run."""
-        from sejax.runs import session  # which draws
+        from sejax.runs import session  # which chooses how matplotlib draws
 
         return contextlib.nullcontext(session.make_chunks(config))
 
@@ -85,7 +83,7 @@ class RayConfig(Options):
     gpus_per_worker: float = option(0.0, fraction())
 
     @contextlib.contextmanager
-    def make(self, config: LearnConfig, say: Callable[[str], None]) -> Iterator["RemoteChunks"]:
+    def make(self, config: LearnConfig) -> Iterator["RemoteChunks"]:
         """The generations of a run, computed by workers while the context is open.
 
         Raises:
