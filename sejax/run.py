@@ -106,7 +106,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     if program != compiled:
                         machines.close()
                         runtime.configure_jax()
-                        made = config.machines.make(config, print)
+                        made = config.machines.make(config)
                         compiled, chunks = program, machines.enter_context(made)
                     ended = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:

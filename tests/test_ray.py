@@ -1,4 +1,4 @@
-"""Runs on a Ray cluster of two nodes here, whose processes are killed and stopped meanwhile.
+"""Runs on a Ray cluster of two nodes here, whose processes are killed meanwhile.
 
 They need the extra `ray`, which `dev` has not (70 MB): `make test-ray`. Other clusters of this
 machine are left alone: ports and folders are our own, and so are the processes that are ended.
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 from safetensors.numpy import load_file
-from support import metrics, printed
+from support import metrics
 
 pytestmark = [
     pytest.mark.slow,
@@ -121,7 +121,7 @@ class Node:
 
     def workers(self):
         mine = processes(self.process.pid)
-        return [pid for pid in mine if command_line(pid).startswith("ray::Worker")]
+        return [pid for pid in mine if command_line(pid).startswith("ray::score")]
 
     def kill(self):
         end(self.process)
@@ -262,13 +262,9 @@ def kill_driver(cluster, driver, rng):
     return Driver(driver.folder, "machines=ray", environment=cluster.environment)
 
 
-def stop_worker(cluster, driver, rng):
-    os.kill(rng.choice(wait_for(cluster.workers)), signal.SIGSTOP)
-
-
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("fault", [kill_worker, kill_node, lose_node, kill_driver, stop_worker])
-def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
+@pytest.mark.parametrize("fault", [kill_worker, kill_node, lose_node, kill_driver])
+def test_a_run_has_the_same_rows_whatever_is_killed_and_when(
     cluster, wanted, seconds, tmp_path, fault, seed
 ):
     rng = random.Random(f"{fault.__name__} {seed}")
@@ -308,19 +304,6 @@ def test_a_run_whose_own_cluster_dies_ends_with_one_message(folder, tmp_path):
     assert len(said) == 1 and "saved" in said[0]
 
 
-def test_a_search_has_its_trials_made_by_workers(cluster, tmp_path):
-    printed(
-        *(sys.executable, "-m", "sejax.search", "env=gridworld_2x2", "agent=q_learning"),
-        *("es.noise_std=interval(0.1, 1)", "es.population_size=2", "trials=4", "verify=0"),
-        *("max_generations=3", "min_generations=1", "machines=ray", "search_dir=search"),
-        cwd=tmp_path,
-        env=cluster.environment,
-        timeout=300,
-    )
-    rows = (tmp_path / "search" / "trials.csv").read_text().splitlines()
-    assert len(rows) - 1 >= 4
-
-
 def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_path):
     with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
         wait_for(driver.generations)
@@ -352,5 +335,5 @@ def test_nothing_is_left_of_a_driver_that_started_its_own_ray(folder, tmp_path, 
         driver.wait({signal.SIGINT: 130, signal.SIGKILL: -signal.SIGKILL}[given])
         wait_for(lambda: not processes(driver.process.pid))
     said = driver.log.read_text().splitlines()
-    left = [x for x in said if not x.startswith(("generation ", "None of 2 workers is ready"))]
+    left = [x for x in said if not x.startswith("generation ")]
     assert len(left) == (given == signal.SIGINT), left

@@ -36,21 +36,15 @@ class NESConfig(StrategyOptions):
     noise_std: float = option(
         0.06,
         positive("candidates must differ", MAX_SCALE),
-        traced=True,
         help="sigma: std of the weight perturbation",
     )
-    noise_std_decay: float = option(
-        0.97, shrinks(), traced=True, help="factor on sigma after each generation"
-    )
+    noise_std_decay: float = option(0.97, shrinks(), help="factor on sigma after each generation")
     step_size: float = option(
         1.0,
         positive("the proxy would not move", MAX_SCALE),
-        traced=True,
         help="alpha: step size of the update",
     )
-    step_size_decay: float = option(
-        1.0, shrinks(), traced=True, help="factor on alpha after each generation"
-    )
+    step_size_decay: float = option(1.0, shrinks(), help="factor on alpha after each generation")
     mirrored: bool = option(
         True, help="each perturbation is tried as +eps and -eps and keeps its better sign"
     )
@@ -65,9 +59,7 @@ class NESConfig(StrategyOptions):
         one_of(UPDATE_RULES),
         help="authors: psi += alpha sum F eps; paper: that divided by n_p sigma",
     )
-    weight_decay: float = option(
-        0.0, fraction(), traced=True, help="psi shrinks by this before each update"
-    )
+    weight_decay: float = option(0.0, fraction(), help="psi shrinks by this before each update")
 
     def make(self, num_dims: int) -> Strategy:
         """NES over vectors of `num_dims` numbers."""

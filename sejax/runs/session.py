@@ -1,7 +1,6 @@
 """The driver of a run: blocks of generations, each saved before the next one starts."""
 
 import contextlib
-import copy
 import dataclasses
 import platform
 import signal
@@ -35,11 +34,6 @@ class Chunks:
     `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
     the chunk before returned it.
 
-    Args:
-      learner: the functions of Algorithm 1. Compiled as they are unless `make` is given.
-      make: `make(*arguments) -> Bilevel`, traced, whose numbers are arguments of the executable.
-      arguments: pytrees with which `make` gives `learner`.
-
     Attributes:
       learner: the functions of Algorithm 1.
       cpu_s: CPU seconds of other processes than this one.
@@ -47,27 +41,10 @@ class Chunks:
 
     cpu_s = 0.0
 
-    def __init__(
-        self,
-        learner: Bilevel,
-        make: Callable[..., Bilevel] | None = None,
-        arguments: tuple[Any, ...] = (),
-    ):
+    def __init__(self, learner: Bilevel):
         self.learner = learner
-        self._make, self._arguments = make or (lambda: learner), arguments
-        self._init = jax.jit(lambda key, *arguments: self._make(*arguments).init(key))
+        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
         self._compiled: dict[int, Any] = {}  # by the length
-
-    def sharing(self, learner: Bilevel, arguments: tuple[Any, ...]) -> "Chunks":
-        """The chunks of a learner with other arguments, by the same executables."""
-        chunks = copy.copy(self)
-        chunks.learner, chunks._arguments = learner, arguments
-        return chunks
-
-    def init(self, key: Array) -> LearnState:
-        """The state before the first generation."""
-        state: LearnState = self._init(key, *self._arguments)
-        return state
 
     def is_ready(self, length: int) -> bool:
         """Whether a chunk of this length has been compiled."""
@@ -76,13 +53,13 @@ class Chunks:
     def compile(self, length: int) -> None:
         """Compiles a chunk of this length."""
 
-        def chunk(state: LearnState, *arguments: Any) -> tuple[LearnState, GenerationInfo]:
-            learner = self._make(*arguments)
-            return jax.lax.scan(lambda state, _: learner.generation(state), state, length=length)
+        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
+            step = self.learner.generation
+            return jax.lax.scan(lambda state, _: step(state), state, length=length)
 
-        state = jax.eval_shape(self._init, jax.random.key(0), *self._arguments)
+        state = jax.eval_shape(self.init, jax.random.key(0))
         jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[length] = jitted.lower(state, *self._arguments).compile()
+        self._compiled[length] = jitted.lower(state).compile()
 
     def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
         """Runs `length` generations; the buffers of the state are donated.
@@ -92,7 +69,7 @@ class Chunks:
         """
         if not self.is_ready(length):
             self.compile(length)
-        state, info = self._compiled[length](state, *self._arguments)
+        state, info = self._compiled[length](state)
         return state, info
 
 

@@ -1,276 +1,270 @@
-"""The study of a search: its storage, and the loop in which a worker takes one trial after another.
+"""The study of a search: its database, the loop in which a worker takes trials, and what is found.
 
-Workers of a study share its database alone. Each shows by heartbeats that it lives. Optuna fails a
-trial whose worker has not done so for some time, and queues it again under a new number.
+Workers of a study share its folder. A worker holds a lock on its trial, which ends with its
+process, however that ends; the next one that looks goes on with a trial whose lock is free.
 """
 
 import contextlib
 import logging
 import math
-import shutil
-import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import filelock
 import numpy as np
 import optuna
-from optuna.exceptions import ExperimentalWarning, TrialPruned, UpdateFinishedTrialError
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
-from optuna.trial import FrozenTrial, Trial, TrialState
+import pandas as pd
+from optuna.trial import Trial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
 
-from sejax.ops.files import require_writable
-from sejax.options import ConfigError, shortened, told
-from sejax.searching.config import REDUCTION_FACTOR, SQLITE, Search
-from sejax.searching.trials import Progress, Runner, worth
+from sejax.ops.files import require_writable, write_text
+from sejax.options import ConfigError, as_text, told
+from sejax.runs.preset_files import file_text
+from sejax.searching import trials
+from sejax.searching.config import REDUCTION_FACTOR, Search
+from sejax.searching.trials import Progress
 
 STORED = "sejax"  # the study's attribute that holds what is searched
-RETRIES = 3  # of a trial whose worker was lost
-GRACE = 4  # heartbeats that may be missed
-LONGEST_WAIT_S = 3600  # for another worker's write to SQLite
+ATTEMPTS = 10  # at a trial whose workers are lost
+LONGEST_WAIT_S = 3600  # for another worker's write to the database
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
+ATTRIBUTES = ("number", "state", "value", "user_attrs")  # of a trial, in tables
+SHOWN = 10
+HOW = ("seed", "devices", "num_parallel", "tracker")  # fields of how trials ran, no settings
 
 
 @contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Without Optuna's warnings that heartbeats may change."""
-    with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
-        yield
-
-
-@_quietly()
-def open_study(search: Search, current: Mapping[str, object] | None = None) -> optuna.Study:
-    """Makes the study, or opens it if it is there.
-
-    Args:
-      search: what is searched.
-      current: values of the searched fields that a new study tries first: they are to be beaten.
-        Not tried if one of them is not among what is searched.
+def usable(search: Search, *more: type[Exception]) -> Iterator[None]:
+    """Within it, trouble with the database is told in one line.
 
     Raises:
-      ConfigError: if the storage cannot be used, or the study is one of another search.
+      ConfigError: in the place of Optuna's errors and its database's, and of `more`.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except (optuna.exceptions.OptunaError, SQLAlchemyError, *more) as error:
+        raise ConfigError(
+            f"search_dir must hold a database that can be used; got {search.folder / 'study.db'} "
+            f"({told(error.__cause__ or error)}). Set search_dir=FOLDER.",
+            "search_dir",
+        ) from error
+
+
+def open_study(search: Search) -> optuna.Study:
+    """Makes the study, whose first trial has the current settings, or opens it if it is there.
+
+    Raises:
+      ConfigError: if the folder cannot be used, or the study is one of another search.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    one_by_one: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
-    if search.config.storage is None:  # or two workers would make the tables of a new file
-        require_writable("search_dir", search.folder)
-        search.folder.mkdir(parents=True, exist_ok=True)
-        one_by_one = filelock.FileLock(search.folder / "study.lock")
-    with one_by_one:
+    config, current = search.config, search.current()
+    require_writable("search_dir", search.folder)
+    (search.folder / "trials").mkdir(parents=True, exist_ok=True)
+    with _lock(search, "study"), usable(search, KeyError, TypeError, ValueError):
         study = optuna.create_study(
             study_name=search.study,
-            storage=_storage(search),
-            pruner=_pruner(search),
+            storage=optuna.storages.RDBStorage(
+                f"sqlite:///{search.folder / 'study.db'}",
+                engine_kwargs={"connect_args": {"timeout": LONGEST_WAIT_S}},
+            ),
+            pruner=optuna.pruners.HyperbandPruner(
+                config.min_generations, config.max_generations, REDUCTION_FACTOR
+            ),
             direction="maximize",
             load_if_exists=True,
         )
+        study.get_trials(deepcopy=False)  # reads all of it
         if STORED in study.user_attrs:
             search.require_same(study.user_attrs[STORED])
             return study
+        first = {x.parameter: x.parameter_of(current[name]) for name, x in search.space.items()}
+        if None not in first.values():
+            study.enqueue_trial(first, skip_if_exists=True)
         study.set_user_attr(STORED, search.stored())
-    values = current or {}
-    first = {x.parameter: x.parameter_of(values.get(name)) for name, x in search.space.items()}
-    if values and None not in first.values():
-        study.enqueue_trial(first, skip_if_exists=True)
     return study
 
 
-@_quietly()
-def work(
-    study: optuna.Study, search: Search, runner: Runner, say: Callable[[str], None] = print
-) -> None:
+# --- trials ---------------------------------------------------------------------------------------
+
+
+def work(study: optuna.Study, search: Search) -> None:
     """Takes trials until as many as asked for have ended.
 
     With several workers a few more may end, as each looks before it takes one.
 
     Raises:
-      KeyboardInterrupt: after queueing the trial at hand again, as after the following.
       ConfigError, OSError: of a trial that cannot be written.
     """
-    started, objective = time.monotonic(), _Objective(search, runner)
-    timeout = math.inf if search.config.timeout is None else search.config.timeout
-    while time.monotonic() - started < timeout:
-        trials = study.get_trials(deepcopy=False)
-        if sum(trial.state in ENDED for trial in trials) >= search.config.trials:
-            return
-        study.sampler = _sampler(search, trials)
-        objective.number, objective.error = None, None
+    while True:
+        with contextlib.ExitStack() as held:
+            with _lock(search, "study"):
+                trial = _claimed(study, search, held)
+            if trial is None:
+                return
+            print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
+
+
+def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) -> Trial | None:
+    """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
+    known = study.get_trials(deepcopy=False)
+    space = {x.parameter: x.distribution for x in search.space.values()}
+    for frozen in known:
+        if frozen.state != TrialState.RUNNING:
+            continue
         try:
-            study.optimize(
-                objective, n_trials=1, callbacks=[lambda _, trial: say(sentence(trial, search))]
-            )
-        except optuna.exceptions.StorageInternalError as error:
-            raise _unusable(search, error) from error
-        except (Exception, KeyboardInterrupt):
-            number, own = objective.number, objective.error
-            if number is None:  # Optuna could not begin one
-                raise
-            if own is not None:
-                RetryHeartbeatStaleTrialCallback(RETRIES)(study, study.trials[number])
-                raise own from None
-            say(f"trial {number}: was taken for dead and is another worker's now")
+            held.enter_context(_lock(search, _name(frozen.number), timeout=0))
+        except filelock.Timeout:  # its worker is there
+            continue
+        attempts = frozen.user_attrs.get("attempts", 1)
+        if attempts < ATTEMPTS:
+            trial = Trial(study, frozen._trial_id)
+            trial.set_user_attr("attempts", attempts + 1)
+            for name, distribution in space.items():  # of which it may lack some
+                trial._suggest(name, distribution)
+            return trial
+        study.tell(frozen.number, state=TrialState.FAIL)
+    if sum(trial.state in ENDED for trial in known) >= search.config.trials:
+        return None
+    if not any(trial.state == TrialState.WAITING for trial in known):
+        # Drawn at once: whoever is killed meanwhile leaves no half of it, and draws the same again.
+        seed = np.random.SeedSequence([search.plain["seed"], len(known)]).generate_state(1)[0]
+        sampler = optuna.samplers.TPESampler(seed=int(seed))
+        draft = optuna.create_study(
+            study_name=study.study_name,
+            sampler=sampler,
+            pruner=study.pruner,
+            direction="maximize",
+        )
+        draft.add_trials(known)
+        study.enqueue_trial(draft.ask(space).params)
+    trial = study.ask(space)
+    held.enter_context(_lock(search, _name(trial.number)))
+    return trial
 
 
-class _Objective:
-    """What Optuna calls for a trial.
-
-    Attributes:
-      number: of the last trial.
-      error: what it has raised, if it shall be tried again.
-    """
-
-    def __init__(self, search: Search, runner: Runner):
-        self._search, self._runner = search, runner
-        self.number: int | None = None
-        self.error: BaseException | None = None
-
-    def __call__(self, trial: Trial) -> float:
-        self.number = trial.number
-        try:
-            return self._score(trial)
-        except (TrialPruned, UpdateFinishedTrialError):
-            raise
-        except BaseException as error:
-            self.error = error
-            raise
-
-    def _score(self, trial: Trial) -> float:
-        overrides = [dimension.suggest(trial) for dimension in self._search.space.values()]
-        try:
-            config = self._runner.config(overrides)
-        except ConfigError as error:  # settings that cannot work together
-            trial.set_user_attr("refused", str(error))
-            raise TrialPruned from error
-        folder = trial_folder(self._search, trial.number)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        # Two workers may draw the same trial from SQLite: the second waits, and finds it done.
-        with filelock.FileLock(folder.with_suffix(".lock")):
-            _take_over(folder, self._search, trial)
-            num_reported = 0
-            for rung in self._search.rungs:
-                progress = self._runner.run(config, folder, rung)
-                for step in range(num_reported + 1, rung + 1):
-                    trial.report(self._worth(progress, step), step)
-                num_reported = rung
-                # Asked at the last rung too, so that the pruner knows of it.
-                is_behind = trial.should_prune() and not progress.is_over
-                if is_behind and rung < self._search.config.max_generations:
-                    break
-            self._keep(trial, progress, rung)
-        score = self._worth(progress, rung)
-        if rung < self._search.config.max_generations or not math.isfinite(score):
-            raise TrialPruned
-        return score
-
-    def _worth(self, progress: Progress, step: int) -> float:
-        return worth(progress, step, self._search)[self._search.config.score]
-
-    def _keep(self, trial: Trial, progress: Progress, step: int) -> None:
-        """Keeps with the trial what the table says of it."""
-        values = {
-            **worth(progress, step, self._search),
-            "generations": progress.generations,
-            "cost": progress.cost,
-            "seconds": round(progress.seconds, 1),
-        }
-        for name, value in values.items():
-            trial.set_user_attr(name, value if np.isfinite(value) else None)
+def _computed(trial: Trial, search: Search) -> str:
+    """Computes a trial rung by rung, until it is pruned or complete; what is said of it."""
+    overrides, last = search.overrides(trial.params), search.config.max_generations
+    study, folder = trial.study, search.folder / _name(trial.number)
+    settings = shlex.join(overrides)
+    trial.set_user_attr("settings", settings)
+    try:
+        run = _begun(search, overrides, folder)
+    except ConfigError as error:  # settings that cannot work together
+        trial.set_user_attr("refused", str(error))
+        study.tell(trial, state=TrialState.PRUNED)
+        return f"refused: {error}"
+    num_reported = len(study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+    for rung in (rung for rung in search.config.rungs if rung >= num_reported):
+        progress = run(rung)
+        for step in range(num_reported + 1, rung + 1):
+            trial.report(float(progress.scores[step - 1]), step)
+        num_reported = rung
+        if rung < last and not progress.is_over and trial.should_prune():
+            break
+    trial.set_user_attr("generations", progress.generations)
+    trial.set_user_attr("train_steps", progress.train_steps)
+    score = float(progress.scores[-1])
+    if rung == last and math.isfinite(score):
+        study.tell(trial, score)
+    else:
+        study.tell(trial, state=TrialState.PRUNED)
+    return f"{score:.4g} after {progress.generations:g} of {last} generations: {settings}"
 
 
-def trial_folder(search: Search, number: int) -> Path:
-    return search.folder / "trials" / f"{number:04d}"
+def _begun(search: Search, overrides: Sequence[str], folder: Path) -> Callable[[int], Progress]:
+    """What computes a trial up to a generation."""
+    config = search.trial_config(overrides)
+    if search.is_of_agent:
+        return trials.tuning(config, search.config.seeds)
+    return trials.learning(config, folder, range(search.config.seeds))
 
 
-def sentence(trial: FrozenTrial, search: Search) -> str:
-    """What is said of a trial that has ended."""
-    kept = trial.user_attrs
-    if "refused" in kept:
-        return f"trial {trial.number}: refused: {kept['refused']}"
-    score = kept.get(search.config.score)
-    shown = "not finite" if score is None else f"{score:.4g}"
-    overrides = " ".join(x.override(trial.params) for x in search.space.values())
-    return (
-        f"trial {trial.number}: {shown} after {kept['generations']:g} of "
-        f"{search.config.max_generations} generations: {overrides}"
-    )
+def _name(number: int) -> str:
+    return f"trials/{number:04d}"
 
 
-def _take_over(folder: Path, search: Search, trial: Trial) -> None:
-    """Copies the folder of the trial that this one is queued in the place of, if it is here.
-
-    A copy, as a process that was only slow may still write to the other one.
-    """
-    frozen = trial.study.get_trials(deepcopy=False)[trial.number]
-    history = RetryHeartbeatStaleTrialCallback.retry_history(frozen)
-    found = [trial_folder(search, number) for number in reversed(history)]
-    before = next((path for path in found if path.is_dir()), None)
-    if before is None or folder.exists():
-        return
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    with contextlib.suppress(shutil.Error):  # a file was replaced meanwhile: the trial begins anew
-        shutil.copytree(before, partial, ignore=shutil.ignore_patterns("*.lock", ".*"))
-        partial.rename(folder)
+def _lock(search: Search, name: str, timeout: float = -1) -> filelock.FileLock:
+    return filelock.FileLock(search.folder / f"{name}.lock", timeout=timeout)
 
 
-def _sampler(search: Search, trials: Sequence[FrozenTrial]) -> optuna.samplers.BaseSampler:
-    """The sampler of the next trial: with a seed, a search that was stopped draws the same.
-
-    What is queued again is no new draw.
-    """
-    seed = search.config.sampler_seed
-    if seed is not None:
-        retried = RetryHeartbeatStaleTrialCallback.retried_trial_number
-        drawn = sum(retried(trial) is None for trial in trials)
-        seed = int(np.random.SeedSequence([seed, drawn]).generate_state(1)[0])
-    if search.config.sampler == "random":
-        return optuna.samplers.RandomSampler(seed=seed)
-    return optuna.samplers.TPESampler(seed=seed)
+# --- what is found --------------------------------------------------------------------------------
 
 
-def _pruner(search: Search) -> optuna.pruners.BasePruner:
-    config = search.config
-    match config.pruner:
-        case "hyperband":
-            return optuna.pruners.HyperbandPruner(
-                config.min_generations, config.max_generations, REDUCTION_FACTOR
-            )
-        case "median":
-            return optuna.pruners.MedianPruner(n_warmup_steps=config.min_generations)
-    return optuna.pruners.NopPruner()
-
-
-def _storage(search: Search) -> RDBStorage:
-    """The database of a search, made if it is not there.
+def report(study: optuna.Study, search: Search) -> None:
+    """Prints and writes what was found; the best settings are tried again.
 
     Raises:
-      ConfigError: if it cannot be used.
+      OSError: if a file cannot be written.
     """
-    is_file, heartbeat = search.storage.startswith(SQLITE), search.config.heartbeat
-    options = {"connect_args": {"timeout": LONGEST_WAIT_S}} if is_file else {}
-    try:
-        return RDBStorage(
-            search.storage,
-            engine_kwargs={"pool_pre_ping": True, **options},
-            heartbeat_interval=heartbeat,
-            grace_period=GRACE * heartbeat,
-            heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(RETRIES),
-        )
-    except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
-        raise _unusable(search, error) from error
+    rows = study.trials_dataframe(ATTRIBUTES)
+    rows = rows.rename(columns=lambda name: name.removeprefix("user_attrs_"))
+    write_text(search.folder / "trials.csv", rows.to_csv(index=False))
+    best = rows[rows["state"] == "COMPLETE"]
+    if best.empty:
+        print("No trial was completed.")
+        return
+    best = best[["number", "value", "generations", "train_steps", "settings"]]
+    best = best.sort_values(["value", "train_steps"], ascending=[False, True], kind="stable")
+    print(f"\nThe best of {len(rows)} trials, of which {len(best)} are complete:")
+    print(best.head(SHOWN).to_string(index=False))
+    if search.config.verify:
+        best = verified(study, search, best.head(search.config.verify))
+    line = write_best(shlex.split(best["settings"].iloc[0]), search)
+    # A module that a file names is not imported, so it is typed beside it.
+    typed = [word for word in search.fixed if ":" in word]
+    preset = f"preset={as_text(str(search.folder / 'preset.yaml'))}"
+    print(f"\nThe best:\n  {line}")
+    print(f"The same:\n  {shlex.join(['python', '-m', search.command, preset, *typed])}")
+    print(f"{search.folder} holds trials.csv, best.txt and preset.yaml.", flush=True)
 
 
-def _unusable(search: Search, error: Exception) -> ConfigError:
-    """The error of a database that cannot be used, which does not tell its password."""
-    field = "search_dir" if search.config.storage is None else "storage"
-    cause = error.__cause__ or error
-    fix = "Set storage=null for a file in search_dir, or search_dir=FOLDER."
-    if isinstance(cause, ImportError) and search.storage.startswith("postgresql:"):
-        fix = "Install its driver with pip install 'psycopg[binary]'."
-    return ConfigError(
-        f"{field} must hold a database that can be used; got "
-        f"{shortened(search.storage.partition('://')[0])} ({told(cause)[:150]}). {fix}",
-        field,
-    )
+def verified(study: optuna.Study, search: Search, best: pd.DataFrame) -> pd.DataFrame:
+    """Tries settings again, as the best score of many is the luckiest too.
+
+    Writes `verification.csv`, a row for each. What has been tried is kept with the study.
+
+    Returns:
+      The rows, the best ones first.
+    """
+    rows = []
+    with _lock(search, "verification"):  # another worker may be at it
+        for row in best.drop(columns=["generations", "train_steps"]).to_dict("records"):
+            name = f"verified/{row['number']:04d}-{search.config.fresh_seeds}"
+            if name not in study.user_attrs:
+                overrides = shlex.split(row["settings"])
+                study.set_user_attr(name, _tried_again(search, overrides, search.folder / name))
+            rows.append({**row, **study.user_attrs[name]})
+    order = ["verified", "verified_cost"]
+    found = pd.DataFrame(rows).sort_values(order, ascending=[False, True], kind="stable")
+    write_text(search.folder / "verification.csv", found.to_csv(index=False))
+    print(f"\nThe best {len(found)}, tried again:\n{found.to_string(index=False)}")
+    returns = ["proxy_return", "real_return"]
+    if len(found) > 2 and {*returns} <= {*found} and (found[returns].nunique() > 1).all():
+        agreed = found[returns].corr(method="spearman").iloc[0, 1]
+        print(f"Rank correlation of the two returns: {agreed:.2f}.")
+    return found
+
+
+def _tried_again(search: Search, overrides: Sequence[str], folder: Path) -> dict[str, float]:
+    """What settings are worth with seeds that no trial has had, and what that costs."""
+    own, config = search.config, search.trial_config(overrides)
+    if search.is_of_agent:
+        return trials.tested(config, own.max_generations)
+    fresh = range(own.seeds, own.seeds + own.fresh_seeds)
+    progress = trials.learning(config, folder, fresh)(own.max_generations)
+    return {"verified": float(progress.scores[-1]), "verified_cost": progress.generations}
+
+
+def write_best(overrides: Sequence[str], search: Search) -> str:
+    """Writes settings as a command, which is returned, and as a preset."""
+    words = [*search.fixed, *overrides]
+    line = shlex.join(["python", "-m", search.command, *words])
+    write_text(search.folder / "best.txt", f"{line}\n")
+    settings = [x for x in words if x.partition("=")[0].partition(".")[0] not in HOW]
+    write_text(search.folder / "preset.yaml", f"# {line}\n{file_text(settings)}")
+    return line

@@ -1,18 +1,11 @@
-"""What a trial of a search computes: runs that learn a proxy, or agents that are tuned on one.
+"""What a trial of a search computes: runs that learn a proxy, or agents that are tuned on one."""
 
-Both go on from the trial's folder, so that a trial may be computed up to one generation, and later
-up to another, by any process.
-"""
-
-import contextlib
 import dataclasses
 import json
-import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,25 +15,18 @@ from jax import Array
 from sejax.agents import make_agent
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
-from sejax.ops.files import write_text
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import require, shortened
-from sejax.options.plain import flatten, to_plain
-from sejax.proxies import header
+from sejax.options import traced_options
+from sejax.options.plain import flatten
 from sejax.runs import config as configuration
 from sejax.runs import session
 from sejax.runs.config import EvaluateConfig, LearnConfig
-from sejax.runs.programs import Programs, kept, static_of, structure_of
 from sejax.runs.run_directory import open_for
 from sejax.runs.worlds import proxy_setup
-from sejax.searching.config import DEFAULT, Search
 
-Config = TypeVar("Config", LearnConfig, EvaluateConfig)
-T = TypeVar("T", list[dict[str, Any]], dict[str, float])
-
-ROUNDS = "rounds.json"
-WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
 HINT = "Set search_dir=FOLDER, a new one."
+COLUMNS = {"the proxy": "proxy", "the real task": "real"}  # of the worlds of `sejax.evaluate`
+_PROGRAMS: dict[str, Callable[..., Outcome]] = {}  # of agents that differ in traced numbers alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,300 +34,141 @@ class Progress:
     """How a trial has gone so far.
 
     Attributes:
-      scores: `[generation, seed]`, nan where nothing finite came of it.
-      cost: training steps of all agents.
-      seconds: on the clock, compiling included.
+      scores: `[generation]`, what a trial is worth after each; nan where nothing finite came of it.
+      train_steps: of all agents.
       generations: that were computed, the mean over seeds: fewer than there are scores where runs
         have solved their task.
       is_over: whether all runs have solved it.
     """
 
     scores: np.ndarray
-    cost: int
-    seconds: float
+    train_steps: int
     generations: float
     is_over: bool = False
 
 
-def worth(progress: Progress, step: int, search: Search) -> dict[str, float]:
-    """What a trial is worth after `step` generations: mean and worst of its seeds."""
-    so_far = progress.scores[:step]
-    match search.measure:
-        case "best":
-            of_seeds = np.fmax.reduce(so_far)
-        case "mean":
-            of_seeds = so_far.mean(axis=0)
-        case _:
-            of_seeds = so_far[-1]
-    return {"mean": float(of_seeds.mean()), "worst": float(of_seeds.min())}
+# --- learning a proxy -----------------------------------------------------------------------------
 
 
-class Runner(Protocol[Config]):
-    """What makes a trial of settings.
+def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callable[[int], Progress]:
+    """Runs that learn proxies, a run directory each, by one executable.
 
-    Attributes:
-      command: the module that repeats a trial.
+    A score is the mean of incumbents over seeds. A run that has solved its task keeps its last one.
+
+    Args:
+      config: of the runs.
+      folder: the run directory; of several, `seed0` and so on in it.
+      seeds: counted from the configuration's own.
+
+    Returns:
+      A function that goes on up to a generation.
     """
+    chunks = session.make_chunks(config)
 
-    command: str
-
-    def config(self, overrides: Sequence[str]) -> Config:
-        """The configuration of a trial.
-
-        Raises:
-          ConfigError: if it is none that can run.
-        """
-
-    def run(self, config: Config, folder: Path, generations: int) -> Progress:
-        """Computes a trial up to a generation.
-
-        Raises:
-          ConfigError: if the folder is of other settings, or damaged.
-          OSError: if a file cannot be written.
-        """
-
-    def verify(self, overrides: Sequence[str], folder: Path) -> dict[str, float]:
-        """What settings are worth with seeds that no trial has had; goes on where it stopped."""
-
-    def order(self, row: dict[str, float]) -> tuple[float, float]:
-        """By which the best rows of `verify` come first."""
-
-
-class Learning:
-    """Learns a proxy in each trial; each of its seeds is a run directory."""
-
-    command = "sejax.run"
-
-    def __init__(self, search: Search):
-        self._search = search
-        self._programs = Programs()
-
-    def config(self, overrides: Sequence[str]) -> LearnConfig:
-        """See `Runner`."""
-        own = f"generations={self._search.config.max_generations}", "checkpoint_every=1"
-        return configuration.config([*self._search.fixed, *overrides, *own])
-
-    def run(self, config: LearnConfig, folder: Path, generations: int) -> Progress:
-        """See `Runner`."""
-        return self._run(config, range(self._search.config.seeds), folder, generations)
-
-    def verify(self, overrides: Sequence[str], folder: Path) -> dict[str, float]:
-        """See `Runner`."""
-        own, config = self._search.config, self.config(overrides)
-        fresh = range(own.seeds, own.seeds + own.fresh_seeds)
-        progress = self._run(config, fresh, folder, own.max_generations)
-        return {
-            **worth(progress, own.max_generations, self._search),
-            "generations": progress.generations,
-        }
-
-    def order(self, row: dict[str, float]) -> tuple[float, float]:
-        """By score, and of equal ones by generations; what is not finite comes last."""
-        score = row[self._search.config.score]
-        return (-score, row["generations"]) if math.isfinite(score) else (math.inf, 0.0)
-
-    def _run(
-        self,
-        config: LearnConfig,
-        seeds: Sequence[int],
-        folder: Path,
-        generations: int,
-    ) -> Progress:
-        """Runs with seeds that are counted from the configuration's own."""
-        scores, cost, seconds, computed, ended = [], 0, 0.0, [], []
-        for seed in seeds:
-            one = dataclasses.replace(
-                config,
-                seed=config.seed + seed,
-                generations=generations,
-                run_dir=str(folder if len(seeds) == 1 else folder / f"seed{config.seed + seed}"),
-            )
-            chunks = self._programs.chunks(one)
+    def run(generations: int) -> Progress:
+        scores, train_steps, computed, ended = [], 0, [], []
+        for seed in (config.seed + offset for offset in seeds):
+            run_dir = str(folder if len(seeds) == 1 else folder / f"seed{seed}")
+            one = dataclasses.replace(config, seed=seed, generations=generations, run_dir=run_dir)
             with open_for(one, HINT) as directory:
                 ended.append(session.run(one, directory, chunks))
                 rows = directory.rows
             own = [float(row["incumbent_mean"]) for row in rows]
-            scores.append(own + own[-1:] * (generations - len(own)))  # solved: it keeps its score
-            steps = sum(float(row["train_steps_mean"]) for row in rows)
-            cost += round(steps * chunks.learner.strategy.num_evaluations)
-            seconds += float(rows[-1]["wall_s"])
             computed.append(len(own))
+            scores.append(own + own[-1:] * (generations - len(own)))
+            steps = sum(float(row["train_steps_mean"]) for row in rows)
+            train_steps += round(steps * chunks.learner.strategy.num_evaluations)
         return Progress(
-            scores=_finite(np.array(scores).T),
-            cost=cost,
-            seconds=seconds,
+            scores=_finite(np.mean(scores, axis=0)),
+            train_steps=train_steps,
             generations=float(np.mean(computed)),
             is_over=all(how == "solved" for how in ended),
         )
 
+    return run
 
-class Tuning:
-    """Trains agents on a proxy in each trial and tests them on the real task.
 
-    A generation is a round of `seeds` fresh agents, whose returns are kept in `rounds.json`. The
-    best settings train agents on the real task too, which alone shows what they are worth there.
+# --- tuning an agent on a proxy -------------------------------------------------------------------
 
-    Args:
-      search: of an agent.
 
-    Raises:
-      ConfigError: if the proxy is not to be found here, which is no fault of a trial's settings.
+def tuning(config: EvaluateConfig, seeds: int) -> Callable[[int], Progress]:
+    """Rounds of fresh agents that train on a proxy and are tested on the real task.
+
+    A score is the mean return of all rounds so far, which rewards learning early: the last one
+    alone is the same for many settings. Nothing is stored, as a round takes a moment.
+
+    Returns:
+      A function that goes on up to a round.
     """
+    rounds: list[Outcome] = []
 
-    command = "sejax.evaluate"
-
-    def __init__(self, search: Search):
-        self._search = search
-        self._default = configuration.evaluate_config([DEFAULT, *search.fixed])
-        header.find(self._default.proxy, "proxy")
-        self._compiled: dict[str, Any] = {}
-
-    def config(self, overrides: Sequence[str]) -> EvaluateConfig:
-        """See `Runner`; also refused are agents that would not learn on the proxy."""
-        config = configuration.evaluate_config([DEFAULT, *self._search.fixed, *overrides])
-        require(
-            len(config.agents) == 1,
-            "agent",
-            "must be one where its settings are searched; got several. Set agent=ppo.",
-        )
-        require(
-            config.agent_hparams == "default",
-            "agent_hparams",
-            f"must be default where settings are searched; got {config.agent_hparams}. Set "
-            "agent_hparams=default.",
-        )
-        proxy_setup(config)  # which checks what is asked of the proxy
-        return config
-
-    def run(self, config: EvaluateConfig, folder: Path, generations: int) -> Progress:
-        """See `Runner`."""
-        settings = self._settings_of(config)
-        rounds = _stored(folder / ROUNDS, settings, list[dict[str, Any]]())[:generations]
-        while len(rounds) < generations:
-            started = time.monotonic()
-            outcome = self._outcome(config, "the proxy", len(rounds), self._search.config.seeds)
-            rounds.append(
-                {
-                    "returns": outcome.test_return.tolist(),
-                    "cost": int(np.sum(outcome.train_steps, dtype=np.int64)),
-                    "seconds": time.monotonic() - started,
-                }
-            )
-            _store(folder / ROUNDS, settings, rounds)
+    def run(generations: int) -> Progress:
+        for number in range(len(rounds), generations):
+            rounds.append(_train_and_test(config, "the proxy", number, seeds))
+        returns = np.array([np.mean(outcome.test_return) for outcome in rounds])
         return Progress(
-            scores=_finite(np.array([each["returns"] for each in rounds], float)),
-            cost=sum(each["cost"] for each in rounds),
-            seconds=sum(each["seconds"] for each in rounds),
+            scores=_finite(returns.cumsum() / np.arange(1, 1 + len(rounds))),
+            train_steps=sum(int(np.sum(x.train_steps, dtype=np.int64)) for x in rounds),
             generations=generations,
         )
 
-    def verify(self, overrides: Sequence[str], folder: Path) -> dict[str, float]:
-        """Returns and steps of `num_agents` fresh agents on the proxy and on the real task.
+    return run
 
-        With `baseline=false` none train on the real task.
-        """
-        config = self.config(overrides)
-        path, settings = folder / "verified.json", self._settings_of(config)
-        values = _stored(path, settings, dict[str, float]())
-        if values:
-            return values
-        for world in proxy_setup(config).worlds:
-            fresh, name = self._search.config.max_generations, WORLDS[world]
-            outcome = self._outcome(config, world, fresh, config.num_agents)
-            values[f"{name}_return"] = float(np.mean(outcome.test_return))
-            values[f"{name}_std"] = float(np.std(outcome.test_return))
-            values[f"{name}_steps"] = float(np.mean(outcome.train_steps))
-        _store(path, settings, values)
-        return values
 
-    def order(self, row: dict[str, float]) -> tuple[float, float]:
-        """By return, and of settings that solve the task by training steps."""
-        where = "real" if self._default.baseline else "proxy"
-        score = row[f"{where}_return"]
-        if not math.isfinite(score):
-            return math.inf, 0.0
-        solved = float(proxy_setup(self._default).task.solved_reward)
-        return -min(score, solved), row[f"{where}_steps"]
+def tested(config: EvaluateConfig, number: int) -> dict[str, float]:
+    """Returns and steps of `num_agents` fresh agents on the proxy, and as many on the real task.
 
-    def _settings_of(self, config: EvaluateConfig) -> str:
-        """What a trial's rounds are of."""
-        fields = flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
-        return json.dumps({**fields, "seeds": self._search.config.seeds})
+    Returns:
+      `verified`, the return on the real task (with `baseline=false` on the proxy) up to where it
+      solves the task, `verified_cost`, training steps, and more of both.
+    """
+    setup, values = proxy_setup(config), dict[str, float]()
+    for world in setup.worlds:
+        outcome, column = _train_and_test(config, world, number, config.num_agents), COLUMNS[world]
+        values[f"{column}_return"] = score = float(np.mean(outcome.test_return))
+        values[f"{column}_std"] = float(np.std(outcome.test_return))
+        values[f"{column}_steps"] = steps = float(np.mean(outcome.train_steps))
+    return {
+        "verified": min(score, float(setup.task.solved_reward)),
+        "verified_cost": steps,
+        **values,
+    }
 
-    def _outcome(
-        self, config: EvaluateConfig, world: str, generation: int, num_agents: int
-    ) -> Outcome:
-        """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
-        setup = proxy_setup(config)
-        ((key, agent_config),) = setup.agents.items()
-        agent = make_agent(agent_config, setup.task, setup.exploration)
-        env, env_params, trainings = setup.worlds[world]
-        training = trainings[key]
 
-        def one(key: Array, hparams: Any) -> Outcome:
-            tried = dataclasses.replace(agent, hparams=hparams)
-            return make_evaluator(tried, env, setup.task, training)(key, env_params)
+def _train_and_test(config: EvaluateConfig, world: str, number: int, num_agents: int) -> Outcome:
+    """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy.
 
-        def make() -> Callable[..., Outcome]:
-            width = num_parallel_on_cpu(agent, training)
-            spread = spread_over_devices(one, config.devices, config.num_parallel, width)
-            return jax.jit(
-                lambda keys, hparams: spread(
-                    keys, jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams)
-                ),
-                compiler_options=compiler_options(),
-            )
+    Configurations that differ in the agent's traced numbers alone share a program.
+    """
+    setup = proxy_setup(config)
+    ((key, agent_config),) = setup.agents.items()
+    agent = make_agent(agent_config, setup.task, setup.exploration)
+    env, env_params, trainings = setup.worlds[world]
+    training = trainings[key]
 
-        key = json.dumps(
-            [
-                world,
-                static_of(agent_config),
-                static_of(setup.exploration),
-                to_plain(training),
-                structure_of(agent.hparams),
-                num_agents,
-            ]
+    def train(key: Array, hparams: Any) -> Outcome:
+        trained = dataclasses.replace(agent, hparams=hparams)
+        return make_evaluator(trained, env, setup.task, training)(key, env_params)
+
+    def program(keys: Array, hparams: Any) -> Outcome:
+        width = num_parallel_on_cpu(agent, training)
+        spread = spread_over_devices(train, config.devices, config.num_parallel, width)
+        outcome: Outcome = spread(
+            keys, jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams)
         )
-        rounds = kept(self._compiled, key, make)
-        seed = jax.random.fold_in(jax.random.key(config.seed), generation)
-        outcome: Outcome = jax.device_get(rounds(jax.random.split(seed, num_agents), agent.hparams))
         return outcome
 
-
-def runner_of(search: Search) -> Learning | Tuning:
-    """What makes the trials of a search."""
-    return Tuning(search) if search.is_of_agent else Learning(search)
+    numbers = {f"agent.{k}" for k, x in traced_options(agent_config).items() if x is not None}
+    fields = flatten(configuration.plain(config)).items()
+    shape = json.dumps([world, *(field for field in fields if field[0] not in numbers)])
+    if shape not in _PROGRAMS:
+        _PROGRAMS[shape] = jax.jit(program, compiler_options=compiler_options())
+    seed = jax.random.fold_in(jax.random.key(config.seed), number)
+    outcome: Outcome = jax.device_get(
+        _PROGRAMS[shape](jax.random.split(seed, num_agents), agent.hparams)
+    )
+    return outcome
 
 
 def _finite(scores: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(scores), scores, np.nan)
-
-
-def _store(path: Path, settings: str, values: T) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps({"settings": settings, "values": values}))
-
-
-def _stored(path: Path, settings: str, default: T) -> T:
-    """The values that a file holds of these settings; the default if it is not there.
-
-    Raises:
-      ConfigError: if it is damaged, or of other settings.
-    """
-    if not path.exists():
-        return default
-    stored = None
-    with contextlib.suppress(ValueError):
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    match stored:
-        case {"settings": found, "values": values}:
-            is_own = found == settings and isinstance(values, type(default))
-        case _:
-            is_own = False
-    require(
-        is_own,
-        "search_dir",
-        f"must be of one study; got {shortened(path)}, which is damaged or of other settings. "
-        f"{HINT}",
-    )
-    return values
