@@ -1,14 +1,11 @@
 """The dueling network in torch: makes the golden numbers that `test_dueling.py` compares with.
 
-The rest of the agent is that of `torch_ddqn.py`. Remake them with `python tests/torch_dueling.py`
-where torch is installed.
+The rest of the agent is that of `torch_ddqn.py`.
 """
 
-import numpy as np
 import torch
-from test_ddqn import nested_params
 from test_dueling import CASES, GOLDEN
-from torch_ddqn import TorchDDQN, golden
+from torch_ddqn import TorchDDQN, write
 from torch_networks import TorchMLP
 
 PARTS = ("features", "value", "advantage")
@@ -40,12 +37,5 @@ class TorchDuelingDDQN(TorchDDQN):
         return DuelingNet(params, self.config.activation)
 
 
-def main():
-    arrays = {}
-    for case, config in CASES.items():
-        arrays |= golden(case, config, nested_params(config), TorchDuelingDDQN)
-    np.savez(GOLDEN, **arrays)
-
-
 if __name__ == "__main__":
-    main()
+    write(GOLDEN, CASES, TorchDuelingDDQN)
