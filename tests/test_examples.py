@@ -1,6 +1,7 @@
 """The scripts in examples/: each runs, in a small size, in a folder that is not the repository."""
 
 import importlib
+import os
 import re
 import shutil
 import sys
@@ -18,6 +19,7 @@ from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 TINY = {
+    "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],
     "own_agent": ["--seeds=2", "--steps=20"],
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
@@ -35,6 +37,7 @@ TINY = {
     "rejax_agent": ["--steps=80", "--test-every=40", "--agents=2", "--episodes=2"],
 }  # fmt: skip
 PRINTS = {
+    "algorithm1": r"^generation 0: new agents return \d+\.\d\n$",
     "own_task": r"best -\d+\.\d+ in generation 0; solved at -1",
     "own_agent": r"test return of each agent: -\d+ -\d+\nmean -\d+",
     "own_objective": r"MaxReward: mean return .*\nRiskAverse: mean return",
@@ -107,6 +110,24 @@ def test_a_command_takes_parts_from_its_folder_and_a_file_imports_none(examples,
     assert refused(sejax.load, here, proxy=proxy) == "task"
     env, _ = sejax.load(here, task=task, proxy=proxy)
     assert env.task is task and env.config == proxy
+
+
+# --- algorithm1 ----------------------------------------------------------------------------------
+
+
+def test_algorithm_1_is_one_short_file_without_sejax():
+    text = (EXAMPLES / "algorithm1.py").read_text()
+    imported = set(re.findall(r"^ *(?:from|import) (\w+)", text, re.MULTILINE))
+    assert imported == {"argparse", "jax", "optax"}
+    assert len(text.splitlines()) <= 160
+
+
+@pytest.mark.slow
+def test_algorithm_1_learns_an_se_whose_agents_solve_cartpole(tmp_path):
+    compiled_in_full = os.environ | {"XLA_FLAGS": ""}
+    said = printed(sys.executable, EXAMPLES / "algorithm1.py", cwd=tmp_path, env=compiled_in_full)
+    returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
+    assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 190
 
 
 # --- own_agent -----------------------------------------------------------------------------------

@@ -1,20 +1,12 @@
-"""The DDQN agent in torch: makes the golden numbers that `test_ddqn.py` holds sejax against.
-
-torch is large and not needed for the tests, so that what it computed is kept in the repository.
-Remake it with `python tests/torch_ddqn.py` where torch is installed.
-"""
+"""The DDQN agent in torch: makes the golden numbers that `test_ddqn.py` holds sejax against."""
 
 import jax
-import numpy as np
 import torch
-from jax.flatten_util import ravel_pytree
+from support import raveled
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, nested_params, random_batch
-from torch_networks import TorchMLP, follow
+from torch_networks import TorchMLP, follow, tensors, write_golden
 
-from sejax.agents.buffers import Transition
 from sejax.agents.dqn import make_ddqn
-
-NUM_UPDATES = 5
 
 
 class TorchDDQN:
@@ -30,10 +22,9 @@ class TorchDDQN:
         return TorchMLP(params, self.config.activation)
 
     def update(self, batch):
-        tensors = Transition(*(torch.tensor(np.array(x)) for x in batch))
-        obs, next_obs = tensors.obs.T, tensors.next_obs.T
-        q = self.online(obs)
-        q = q.gather(1, tensors.action.long()[:, None])[:, 0]
+        batch = tensors(batch)
+        next_obs = batch.next_obs.T
+        q = self.online(batch.obs.T).gather(1, batch.action.long()[:, None])[:, 0]
         with torch.no_grad():
             values = self.target(next_obs)
             if self.config.double:
@@ -41,7 +32,7 @@ class TorchDDQN:
                 value = values.gather(1, best[:, None])[:, 0]
             else:
                 value = values.max(1).values
-            goal = tensors.reward + self.config.discount * tensors.discount * value
+            goal = batch.reward + self.config.discount * batch.discount * value
         kinds = {"squared": torch.nn.functional.mse_loss,
                  "huber": torch.nn.functional.smooth_l1_loss}  # fmt: skip
         loss = kinds[self.config.loss](q, goal)
@@ -52,29 +43,22 @@ class TorchDDQN:
         if self.num_updates % self.config.target_update_every == 0:
             follow(self.target, self.online, self.config.tau)
 
-
-def golden(case, config, nested, make_reference=TorchDDQN):
-    """Parameters before, after one, and after five updates on the test's batches."""
-    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-    params = agent.init(jax.random.key(1), agent.hparams).params
-    # Target and online network apart from the start, so that it shows which is used where.
-    target_params = params[::-1]
-    reference = make_reference(nested(params), nested(target_params), config)
-    arrays = {f"{case}/params/0": params, f"{case}/target_params/0": target_params}
-    for number in range(1, NUM_UPDATES + 1):
-        reference.update(random_batch(number))
-        if number in (1, NUM_UPDATES):
-            for name, net in (("params", reference.online), ("target_params", reference.target)):
-                arrays[f"{case}/{name}/{number}"] = ravel_pytree(net.nested())[0]
-    return {name: np.array(x) for name, x in arrays.items()}
+    def flat(self):
+        """Parameters as the agent keeps them."""
+        nets = {"params": self.online, "target_params": self.target}
+        return {name: raveled(net.nested()) for name, net in nets.items()}
 
 
-def main():
-    arrays = {}
-    for case, config in CASES.items():
-        arrays |= golden(case, config, nested_params(config))
-    np.savez(GOLDEN / "ddqn_updates.npz", **arrays)
+def write(path, configs, make_reference):
+    """Writes parameters before, after one, and after five updates on the test's batches."""
+    references = {}
+    for case, config in configs.items():
+        agent, nested = make_ddqn(config, OBS_DIM, NUM_ACTIONS), nested_params(config)
+        params = agent.init(jax.random.key(1), agent.hparams).params
+        # Target and online network apart from the start, so that it shows which is used where.
+        references[case] = make_reference(nested(params), nested(params[::-1]), config)
+    write_golden(path, references, (0, 1, 5), lambda case, number: [random_batch(number)])
 
 
 if __name__ == "__main__":
-    main()
+    write(GOLDEN / "ddqn_updates.npz", CASES, TorchDDQN)

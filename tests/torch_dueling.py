@@ -1,13 +1,11 @@
 """The dueling network in torch: makes the golden numbers that `test_ddqn.py` compares with.
 
-The rest of the agent is that of `torch_ddqn.py`. Remake them with `python tests/torch_dueling.py`
-where torch is installed.
+The rest of the agent is that of `torch_ddqn.py`.
 """
 
-import numpy as np
 import torch
-from test_ddqn import DUELING_CASES, GOLDEN, nested_params
-from torch_ddqn import TorchDDQN, golden
+from test_ddqn import DUELING_CASES, GOLDEN
+from torch_ddqn import TorchDDQN, write
 from torch_networks import TorchMLP
 
 PARTS = ("features", "value", "advantage")
@@ -39,12 +37,5 @@ class TorchDuelingDDQN(TorchDDQN):
         return DuelingNet(params, self.config.activation)
 
 
-def main():
-    arrays = {}
-    for case, config in DUELING_CASES.items():
-        arrays |= golden(case, config, nested_params(config), TorchDuelingDDQN)
-    np.savez(GOLDEN / "dueling_updates.npz", **arrays)
-
-
 if __name__ == "__main__":
-    main()
+    write(GOLDEN / "dueling_updates.npz", DUELING_CASES, TorchDuelingDDQN)

@@ -1,5 +1,10 @@
-"""Networks in torch that the golden agents share: a perceptron from our parameters, and back."""
+"""What the golden agents in torch share: a perceptron from our parameters and back, their files.
 
+torch is large and not needed for the tests, so that what it computed is kept in the repository.
+Where it is installed, `python tests/torch_NAME.py` makes the numbers of `test_NAME.py` again.
+"""
+
+import jax
 import numpy as np
 import torch
 
@@ -64,3 +69,27 @@ def follow(slow, fast, tau):
     """Moves the parameters of a target network towards those of the other."""
     for target, source in zip(slow.parameters(), fast.parameters(), strict=True):
         target.copy_(tau * source + (1 - tau) * target)
+
+
+def tensors(tree):
+    """A pytree's arrays in torch."""
+    return jax.tree.map(lambda x: torch.tensor(np.array(x)), tree)
+
+
+def write_golden(path, references, checked, inputs):
+    """Writes what `flat()` gives of each case's agent after some updates; 0 is before the first.
+
+    Args:
+      references: agents by the names of their cases.
+      checked: numbers of updates.
+      inputs: of a case and the number of an update, its arguments.
+    """
+    arrays = {}
+    for case, reference in references.items():
+        for number in range(max(checked) + 1):
+            if number > 0:
+                reference.update(*inputs(case, number))
+            if number in checked:
+                now = reference.flat().items()
+                arrays |= {f"{case}/{name}/{number}": np.array(x) for name, x in now}
+    np.savez(path, **arrays)

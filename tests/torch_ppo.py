@@ -1,8 +1,4 @@
-"""The PPO agent in torch: makes the golden numbers that `test_ppo.py` holds sejax against.
-
-torch is large and not needed for the tests, so that what it computed is kept in the repository.
-Remake it with `python tests/torch_ppo.py` where torch is installed.
-"""
+"""The PPO agent in torch: makes the golden numbers that `test_ppo.py` holds sejax against."""
 
 import jax
 import numpy as np
@@ -20,11 +16,9 @@ from test_ppo import (
     ppo,
     random_steps,
 )
-from torch_networks import TorchMLP
+from torch_networks import TorchMLP, tensors, write_golden
 
 from sejax.agents.ppo import shuffled
-
-NUM_PHASES = 2
 
 
 def loss_fn(log_prob, entropy, value, old_log_prob, returns, advantage=None):
@@ -64,9 +58,8 @@ class TorchPPO:
         policy = torch.distributions.Normal(torch.tanh(self.actor(obs)) * MAX_ACTION, self.std)
         return policy.log_prob(action).sum(1), policy.entropy().sum(1)
 
-    def learn(self, steps, ended):
-        steps = steps._replace(weight=0.0)
-        steps = type(steps)(*(torch.tensor(np.array(x)) for x in steps))
+    def update(self, steps, ended):
+        steps = tensors(steps)
         old_log_prob = self.evaluate(steps.obs, steps.action)[0].detach()
         if self.config.advantages == "gae":
             returns, advantage = self.bootstrapped(steps, ended)
@@ -125,24 +118,15 @@ class TorchPPO:
 
     def flat(self):
         actor, critic = ({"params": x.nested()} for x in (self.actor, self.critic))
-        return raveled({"actor": actor, "critic": critic, "std": self.std.detach().numpy()})
+        std = self.std.detach().numpy()
+        return {"params": raveled({"actor": actor, "critic": critic, "std": std})}
 
 
-def main():
-    """Writes the parameters before and after each learning phase."""
-    arrays = {}
-    for kind in KINDS:
-        _, _, unravel = networks(kind)
-        agent = ppo(kind)
-        params = agent.init(jax.random.key(1), agent.hparams).params
-        reference = TorchPPO(kind, unravel(params))
-        arrays[f"{kind}/params/0"] = params
-        for number in range(1, NUM_PHASES + 1):
-            steps, ended = random_steps(kind, number)
-            reference.learn(steps, ended)
-            arrays[f"{kind}/params/{number}"] = reference.flat()
-    np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
+def initial(kind):
+    agent = ppo(kind)
+    params = agent.init(jax.random.key(1), agent.hparams).params
+    return TorchPPO(kind, networks(kind)[2](params))
 
 
 if __name__ == "__main__":
-    main()
+    write_golden(GOLDEN, {kind: initial(kind) for kind in KINDS}, (0, 1, 2), random_steps)

@@ -1,8 +1,7 @@
 """SAC in torch, for both kinds of actions: makes the golden numbers of `test_sac.py`.
 
-torch is large and not needed for the tests, so that what it computed is kept in the repository.
 Densities and entropies are those of torch's distributions, and each loss has an optimizer of its
-own. Remake it with `python tests/torch_sac.py` where torch is installed.
+own.
 """
 
 import jax
@@ -14,7 +13,6 @@ from test_sac import (
     CASES,
     CHECKED_UPDATES,
     GOLDEN,
-    NAMES,
     case_batch,
     case_noise,
     nested,
@@ -22,7 +20,7 @@ from test_sac import (
 )
 from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-from torch_networks import TorchMLP, follow
+from torch_networks import TorchMLP, follow, tensors, write_golden
 
 
 class TorchSAC:
@@ -77,15 +75,12 @@ class TorchSAC:
 
     def update(self, batch, noise):
         config = self.config
-        counted = torch.tensor(np.array(batch.weight)) > 0
-
-        def columns(x):
-            return None if x is None else torch.tensor(np.array(x)).T[counted]
-
-        obs, next_obs, next_noise, noise = map(columns, (batch.obs, batch.next_obs, *noise))
-        action = columns(batch.action)
+        batch, noise = tensors((batch, noise))
+        counted = batch.weight > 0
+        (obs, action, reward, discount, next_obs), (next_noise, noise) = jax.tree.map(
+            lambda x: x.T[counted], (batch[:5], tuple(noise))
+        )
         action = action.long() if self.is_discrete else action
-        reward, discount = columns(batch.reward), columns(batch.discount)
         with torch.no_grad():
             q, entropy = self.soft_values(self.target_critics, next_obs, next_noise)
             target = reward + config.discount * discount * (q + self.alpha() * entropy)
@@ -125,18 +120,8 @@ class TorchSAC:
         }
 
 
-def main():
-    """Writes all parameters after some of the updates on the test's batches and noise."""
-    arrays = {}
-    for case in CASES:
-        reference = TorchSAC(case)
-        for number in range(1, max(CHECKED_UPDATES) + 1):
-            reference.update(case_batch(case, number), case_noise(case, number))
-            if number in CHECKED_UPDATES:
-                after = reference.flat()
-                arrays |= {f"{case}/{name}/{number}": after[name].copy() for name in NAMES}
-    np.savez(GOLDEN, **arrays)
-
-
 if __name__ == "__main__":
-    main()
+    write_golden(
+        GOLDEN, {case: TorchSAC(case) for case in CASES}, CHECKED_UPDATES,
+        lambda case, number: (case_batch(case, number), case_noise(case, number)),
+    )  # fmt: skip

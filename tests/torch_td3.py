@@ -1,8 +1,4 @@
-"""TD3 in torch, for both kinds of actions: makes the golden numbers of `test_td3.py`.
-
-torch is large and not needed for the tests, so that what it computed is kept in the repository.
-Remake it with `python tests/torch_td3.py` where torch is installed.
-"""
+"""TD3 in torch, for both kinds of actions: makes the golden numbers of `test_td3.py`."""
 
 import functools
 
@@ -14,13 +10,12 @@ from test_td3 import (
     CHECKED_UPDATES,
     GOLDEN,
     MAX_ACTION,
-    NAMES,
     case_batch,
     case_noise,
     initial_params,
     nested_params,
 )
-from torch_networks import TorchMLP, follow
+from torch_networks import TorchMLP, follow, tensors, write_golden
 
 from sejax.agents.td3 import DiscreteTD3Config
 
@@ -63,14 +58,11 @@ class TorchTD3:
     def update(self, batch, noise):
         self.num_updates += 1
         config = self.config
+        batch, noise = tensors((batch, noise))
         obs, action, next_obs, smoothing, target_gumbel, gumbel = (
-            None if x is None else torch.tensor(np.array(x)).T
-            for x in (batch.obs, batch.action, batch.next_obs, *noise)
+            None if x is None else x.T for x in (batch.obs, batch.action, batch.next_obs, *noise)
         )
-        reward, discount, weight = (
-            torch.tensor(np.array(x)) for x in (batch.reward, batch.discount, batch.weight)
-        )
-        counted = weight > 0
+        counted = batch.weight > 0
 
         def q_value(critic, obs, action):
             return critic(torch.cat([obs, action], dim=1))[:, 0]
@@ -85,7 +77,7 @@ class TorchTD3:
                 next_action = next_action + smoothing * MAX_ACTION
                 next_action = next_action.clamp(-MAX_ACTION, MAX_ACTION)
             next_q = [q_value(critic, next_obs, next_action) for critic in self.target_critics]
-            goal = reward + config.discount * discount * torch.min(*next_q)
+            goal = batch.reward + config.discount * batch.discount * torch.min(*next_q)
         loss = sum(
             torch.nn.functional.mse_loss(q_value(critic, obs, action)[counted], goal[counted])
             for critic in self.critics
@@ -112,18 +104,9 @@ class TorchTD3:
         }
 
 
-def main():
-    """Writes all parameters after some of the updates on the test's batches and noise."""
-    arrays = {}
-    for case, config in CASES.items():
-        reference = TorchTD3(initial_params(config), config)
-        for number in range(1, max(CHECKED_UPDATES) + 1):
-            reference.update(case_batch(config, number), case_noise(config, number))
-            if number in CHECKED_UPDATES:
-                after = reference.flat()
-                arrays |= {f"{case}/{name}/{number}": after[name].copy() for name in NAMES}
-    np.savez(GOLDEN, **arrays)
-
-
 if __name__ == "__main__":
-    main()
+    references = {case: TorchTD3(initial_params(config), config) for case, config in CASES.items()}
+    write_golden(
+        GOLDEN, references, CHECKED_UPDATES,
+        lambda case, number: (case_batch(CASES[case], number), case_noise(CASES[case], number)),
+    )  # fmt: skip

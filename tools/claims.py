@@ -31,17 +31,14 @@ ROOT = Path(__file__).parents[1]
 NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?%?"
 NAN = r" \[nan, nan\]|\bnan%?"  # an interval that too few values leave unknown, or a mean
 TABLE = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
-# What no number is looked for in: generated tables, comments, code, mathematics, addresses.
+# What no number is looked for in: comments, code, mathematics, addresses, directives and their
+# options; numbers of headings, of lists and of years, and those in names.
 HIDDEN = re.compile(
     r"<!--.*?-->|^ *(`{3,}).*?^ *\1|`[^`]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)]*\)|https?://\S+"
-    r"|^:[^\n]*",  # directives and their options
-    re.DOTALL | re.MULTILINE,
-)
-# Numbers of headings, of lists and of years, and those in names.
-NAMES = re.compile(
-    r"^#+ [\d.]+|^\d+\. |\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
+    r"|^:[^\n]*|^#+ [\d.]+|^\d+\. "
+    r"|\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
     r"|\((?:[^()]*, )?(?:19|20)\d\d\)|\bet al\.,? (?:[A-Z]+ )?(?:19|20)\d\d",
-    re.MULTILINE,
+    re.DOTALL | re.MULTILINE,
 )
 UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
 FUNCTIONS = {"len": len, "min": min, "max": max, "sum": sum, "round": round, "abs": abs}
@@ -66,11 +63,6 @@ class Claims:
         """The tables of `results/`, and the numbers behind them."""
         return remake.remake(self.root)
 
-    @functools.cached_property
-    def summaries(self) -> dict[str, str]:
-        """The numbers behind each table, by the file that they would be."""
-        return {str(each.summary_file): each.summary for each in self.remade}
-
     def frame(self, rows: str) -> Any:
         """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, settings."""
         if rows.startswith("settings "):
@@ -87,7 +79,8 @@ class Claims:
         rows, _, variant = rows.partition("#")
         path = self.root / rows
         if path.name.endswith("summary.csv"):
-            return pd.read_csv(io.StringIO(self.summaries[rows]))
+            summaries = {str(each.summary_file): each.summary for each in self.remade}
+            return pd.read_csv(io.StringIO(summaries[rows]))
         if path.suffix == ".json":
             return yaml.safe_load(path.read_text())
         found = read_rows(path)
@@ -95,8 +88,9 @@ class Claims:
 
     def selected(self, entry: Mapping[str, Any]) -> dict[str, Any]:
         """The frames of an entry by name; one file is `rows`."""
-        names = entry["rows"] if isinstance(entry["rows"], dict) else {"rows": entry["rows"]}
-        frames = {name: self.frame(rows) for name, rows in names.items()}
+        rows = entry.get("rows", {})
+        named = rows if isinstance(rows, dict) else {"rows": rows}
+        frames = {name: self.frame(rows) for name, rows in named.items()}
         if "where" in entry:
             frames["rows"] = frames["rows"].query(entry["where"])
         return frames
@@ -119,10 +113,8 @@ class Claims:
         table = self.entries["tables"][name]
         made = [table["head"], " | ".join("---" for _ in table["head"].split("|"))]
         for line in table["lines"]:
-            if "values" in line or "rows" not in line:
-                each: Any = [self.values(line) if "rows" in line else {}]
-            else:
-                each = self.selected(line)["rows"].to_dict("records")
+            is_one = "values" in line or "rows" not in line
+            each = [self.values(line)] if is_one else self.selected(line)["rows"].to_dict("records")
             made += [re.sub(NAN, "", line["cells"].format_map(row)) for row in each]
         return [re.sub(" +", " ", f"| {line} |") for line in made]
 
@@ -234,7 +226,7 @@ def replaced(found: re.Match[str], said: list[str]) -> str:
 
 def unclaimed(name: str, text: str, covering: Iterable[re.Pattern[str]]) -> Iterator[str]:
     """The numbers of a text that are in no generated table, claim or stated phrase."""
-    for pattern in (*covering, TABLE, HIDDEN, NAMES):
+    for pattern in (*covering, TABLE, HIDDEN):
         text = pattern.sub(lambda x: re.sub(r"\S", " ", x[0]), text)
     for found in UNCLAIMED.finditer(text):
         line = text.count("\n", 0, found.start()) + 1

@@ -58,14 +58,13 @@ def row(proxy: sejax.PretrainedProxy, verdicts: Mapping[str, str]) -> dict[str, 
 def section(proxy: sejax.PretrainedProxy) -> str:
     """What a card says of this proxy alone: its facts, what it teaches and how it was learned."""
     title, *sections = re.split(r"\n\n(?=## )", proxy.card)
+    bodies = dict(text.split("\n\n", 1) for text in sections)
     name, _, facts = title.split("\n\n", 2)
     kept = [f"#{name}", facts]
-    for text in sections:
-        heading, _, body = text.partition("\n\n")
-        if heading == "## What it teaches":
-            kept.append(body.partition("\n\n")[2])
-        elif heading == "## How it was learned":
-            kept.append(f"Learned by:\n\n{body}")
+    if "## What it teaches" in bodies:
+        kept.append(bodies["## What it teaches"].partition("\n\n")[2])
+    if "## How it was learned" in bodies:
+        kept.append(f"Learned by:\n\n{bodies['## How it was learned']}")
     return "\n\n".join(kept)
 
 
