@@ -19,7 +19,7 @@ import sejax.gym
 from sejax import envs
 from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import registry
+from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import find, is_same_space, pretrained_names
 
@@ -418,46 +418,35 @@ def test_what_ships_is_registered_once_and_by_its_name():
     np.testing.assert_array_equal(env.reset(seed=1)[0], make("cartpole").reset(seed=1)[0])
 
 
-NO_BACKEND = """
+PROGRAM = """
 import sys
 import sejax
 sejax.pretrained()
 assert "gymnasium" not in sys.modules
 import sejax.gym
 from gymnasium.vector import AsyncVectorEnv
-env = sejax.gym.make("cartpole")
-env.reset(seed=0)
-env.step(1)
-sejax.gym.make("cartpole-rn").reset(seed=0)
-envs = AsyncVectorEnv([lambda: sejax.gym.make("cartpole")] * 2, context="fork")
-envs.reset(seed=0)
-loaded = {"stable_baselines3", "torch"} & set(sys.modules)
-from jax._src import xla_bridge
-print(envs.step([0, 1])[0].shape, sorted(loaded), xla_bridge.backends_are_initialized())
-envs.close()
-"""
-IN_NEW_PROCESSES = """
-import gymnasium
 
 def make():
+    import gymnasium
     return gymnasium.make("sejax.gym:sejax/cartpole")
 
 if __name__ == "__main__":
-    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="CONTEXT")
-    print(envs.reset(seed=0)[0].shape, gymnasium.spec("sejax/cartpole").id)
+    sejax.gym.make("cartpole-rn").reset(seed=0)
+    envs = AsyncVectorEnv([make] * 2, context="CONTEXT")
+    envs.reset(seed=0)
+    loaded = {"stable_baselines3", "torch"} & set(sys.modules)
+    from jax._src import xla_bridge
+    assert not xla_bridge.backends_are_initialized()
+    print(envs.step([0, 1])[0].shape, make().spec.id, sorted(loaded))
     envs.close()
 """
 
 
-def test_it_starts_no_backend_of_jax_and_runs_in_forked_processes():
-    assert printed(sys.executable, "-c", NO_BACKEND) == "(2, 4) [] False\n"
-
-
-@pytest.mark.parametrize("context", ["spawn", "forkserver"])
-def test_ids_that_name_the_package_are_known_in_new_processes(context):
+@pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
+def test_it_starts_no_backend_of_jax_and_its_ids_are_known_in_new_processes(context):
     """In a fresh process, as the test's own has what its processes would need to import."""
-    program = IN_NEW_PROCESSES.replace("CONTEXT", context)
-    assert printed(sys.executable, "-c", program) == "(2, 4) sejax/cartpole\n"
+    program = PROGRAM.replace("CONTEXT", context)
+    assert printed(sys.executable, "-c", program) == "(2, 4) sejax/cartpole []\n"
 
 
 @pytest.mark.parametrize("env", [make("cartpole"), sejax.gym.GridWorld("gridworld_2x2")])
@@ -585,6 +574,13 @@ def test_weights_that_are_not_the_networks_are_refused_as_in_jax(tmp_path):
 )
 def test_an_option_that_cannot_be_is_one_message(field, options):
     assert refused(make_vec, "cartpole", **options) == field
+
+
+def test_without_stable_baselines3_one_message_says_what_to_install(monkeypatch):
+    for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=r"pip install 'sejax\[sb3\]'"):
+        sejax.gym.make_sb3("cartpole")
 
 
 def test_seeds_and_masks_have_the_length_of_the_lanes():

@@ -5,7 +5,6 @@ They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-exa
 
 import pickle
 import re
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -16,29 +15,19 @@ from test_gym import SES, assert_same, world_of
 
 import sejax.gym
 from sejax.gym import SyntheticEnv
-from sejax.options import ConfigError
 from sejax.proxies import header
 
-try:
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.env_checker import check_env
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+pytest.importorskip("stable_baselines3", reason="needs the extra sb3: make test-examples")
 
-    from sejax.gym.sb3 import SyntheticVecEnv
-except ImportError:
-    PPO = None
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from sejax.gym.sb3 import SyntheticVecEnv
+
 PAGE = Path(__file__).parents[1] / "docs/gymnasium.md"
-needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make test-examples")
 
 
-def test_without_it_one_message_says_what_to_install(monkeypatch):
-    for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"pip install 'sejax\[sb3\]'"):
-        sejax.gym.make_sb3("cartpole")
-
-
-@needs_sb3
 @pytest.mark.parametrize("name", SES)
 def test_lanes_are_single_environments(name):
     world, num_envs = world_of(**SES[name]), 3
@@ -59,7 +48,6 @@ def test_lanes_are_single_environments(name):
     assert_same(lanes.reset(), copy.reset(), tolerance=0)
 
 
-@needs_sb3
 def test_lanes_have_their_own_attributes_and_step_together():
     envs = sejax.gym.make_sb3("cartpole", 3)
     assert envs.get_attr("render_mode") == [None] * 3 and not envs.has_attr("nothing")
@@ -75,7 +63,6 @@ def test_lanes_have_their_own_attributes_and_step_together():
     envs.close()
 
 
-@needs_sb3
 @pytest.mark.parametrize("name", header.pretrained_names())
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric:UserWarning")
 def test_its_checker_passes_for_what_ships(name):
@@ -83,7 +70,6 @@ def test_its_checker_passes_for_what_ships(name):
     check_env(gymnasium.make(f"sejax/{name}"))
 
 
-@needs_sb3
 @pytest.mark.parametrize("name", ["cartpole", "cartpole-rn"])
 def test_an_agent_of_theirs_trains_there(name):
     envs = VecMonitor(sejax.gym.make_sb3(name, 4))
@@ -92,28 +78,22 @@ def test_an_agent_of_theirs_trains_there(name):
     assert model.num_timesteps == 128 and len(model.ep_info_buffer) > 0
 
 
-@needs_sb3
 @pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")
 def test_the_page_runs_and_its_torch_networks_are_the_se():
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) > 5
+    assert len(blocks) > 5 and "load_file" in blocks[-1]
     for block in blocks:
         names = {}
         short = re.sub(r"learn\([\d_]+\)", "learn(256)", block)
         exec(compile(short, PAGE.name, "exec"), names)
-        if "load_file" in block:
-            world = sejax.gym.make("cartpole").world
-            noise, actions = names["noise"].numpy(), names["actions"].numpy().argmax(axis=1)
-            first = world.first(noise)
-            encoded = np.eye(2, dtype=np.float32)[actions]
-            step = world.step(first, encoded, np.ones(len(actions)))
-            np.testing.assert_allclose(names["obs"].detach(), first, atol=1e-5)
-            np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
-            return
-    pytest.fail("no recipe for torch")
+    world = sejax.gym.make("cartpole").world
+    first = world.first(names["noise"].numpy())
+    actions = names["actions"].numpy().astype(np.float32)  # one-hot
+    step = world.step(first, actions, np.ones(len(actions)))
+    np.testing.assert_allclose(names["obs"].detach(), first, atol=1e-5)
+    np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
 
 
-@needs_sb3
 def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():
     """docs/gymnasium.md: make_vec_env asks for pictures, and set_env compares spaces."""
     from stable_baselines3.common.env_util import make_vec_env
@@ -130,7 +110,6 @@ def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():
     agent.learn(64)
 
 
-@needs_sb3
 @pytest.mark.parametrize(
     ("name", "task"), [("CartPole-v1", "cartpole"), ("Pendulum-v1", "pendulum")]
 )

@@ -8,14 +8,13 @@ environments fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb
 all: docs/gymnasium.md.
 
 Example:
+  >>> import gymnasium
   >>> env = gymnasium.make("sejax.gym:sejax/cartpole")  # or make(...), of a run directory
   >>> obs, info = env.reset(seed=0)
   >>> obs, reward, terminated, truncated, info = env.step(1)
   >>> obs.shape, terminated, truncated  # episodes of the shipped SEs have one step
   ((4,), True, False)
 """
-
-import gymnasium
 
 from sejax.gym.registration import make, make_sb3, make_vec, register
 from sejax.gym.reward import RewardNetwork
@@ -30,7 +29,6 @@ __all__ = [
     "SyntheticEnv",
     "SyntheticVectorEnv",
     "SyntheticWorld",
-    "gymnasium",
     "make",
     "make_sb3",
     "make_vec",

@@ -128,8 +128,9 @@ class Search:
     def plain(self) -> dict[str, Any]:
         """The plain values of a trial whose overrides are the fixed ones; one agent is `agent`."""
         values: dict[str, Any] = configuration.plain(self.trial_config([]))
-        alone = list(values["agents"].values()) if len(values["agents"]) == 1 else []
-        return values | {"agent": agent for agent in alone}
+        if len(values["agents"]) == 1:
+            (values["agent"],) = values["agents"].values()
+        return values
 
     @property
     def agents(self) -> dict[str, str]:
