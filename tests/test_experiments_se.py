@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 import yaml
 from support import assert_equal, paper_training, refused
-from test_experiments import TINY, TINY_AGENT, save_ses, tiny
+from test_experiments import TINY, TINY_AGENT, fields, save_ses, tiny
 
 import sejax
 from experiments import se_feasibility, se_performance
@@ -30,7 +30,7 @@ def ses(tmp_path_factory):
 
 def run(name, module, out, **given):
     """The table of an experiment with tiny settings."""
-    options = TINY[name] | {"quick": True, "seed": 3, "out": str(out)} | given
+    options = fields(TINY[name].replace("fixed=SE", ""), out=str(out), **given)
     return module.EXPERIMENT.run(module.EXPERIMENT.settings.of(**options))
 
 
