@@ -84,8 +84,3 @@ def test_costs_are_those_of_the_card():
     for card in sejax.pretrained():
         costs = proxy_users.costs_of(card.name)
         assert costs["learning_steps"] == card.learning.real_steps > 0
-
-
-def test_the_kind_of_agents_is_the_first_that_the_proxy_was_learned_with():
-    study = proxy_users.Study(proxy_users.BreakEven.of(quick=True), sejax.load_proxy("cartpole"))
-    assert study.kind == "ddqn"

@@ -1,22 +1,25 @@
 """The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
+import functools
+
 import jax
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 import yaml
-from support import paper_training, refused
-from test_experiments import TINY, TINY_AGENT, save_ses
+from support import assert_equal, paper_training, refused
+from test_experiments import TINY, TINY_AGENT, fields, save_ses, tiny
 
 import sejax
 from experiments import se_feasibility, se_performance
-from experiments.common import agents, figures, runs, shards
-from experiments.common.statistics import (
-    mean_interval,
-)
+from experiments.common import figures, runs, shards
+from experiments.common.statistics import mean_interval
 from sejax import envs
 from sejax.options import ConfigError
 from sejax.runs import config as configuration
+
+tiny_agents = tiny  # a fixture
 
 
 @pytest.fixture(scope="module")
@@ -25,14 +28,9 @@ def ses(tmp_path_factory):
     return save_ses(tmp_path_factory.mktemp("s") / "s.safetensors", 3, "training.max_steps=40")
 
 
-@pytest.fixture
-def tiny_agents(monkeypatch):
-    monkeypatch.setattr(agents, "QUICK_AGENT", TINY_AGENT)
-
-
 def run(name, module, out, **given):
     """The table of an experiment with tiny settings."""
-    options = TINY[name] | {"quick": True, "seed": 3, "out": str(out)} | given
+    options = fields(TINY[name].replace("fixed=SE", ""), out=str(out), **given)
     return module.EXPERIMENT.run(module.EXPERIMENT.settings.of(**options))
 
 
@@ -56,22 +54,19 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
         run("se_feasibility", se_feasibility, tmp_path, **given)
         return shards.read_rows(tmp_path / "rows.csv.xz").drop(columns=["wall_s", "cpu_s"])
 
-    first = learned(generations=1)
-    made = learned(generations=3)
+    first, made = learned(generations=1), learned(generations=3)
     assert made.groupby("seed").size().to_dict() == {3: 3, 4: 3}
     pd.testing.assert_frame_equal(made[made["generation"] == 0].reset_index(drop=True), first)
-    stored = sejax.load_set(tmp_path / "ses.safetensors")
     config = yaml.safe_load((tmp_path / "work/runs/seed4/config.yaml").read_text())
-    assert config["seed"] == 4 and config["proxy"]["hidden_size"] == 4
     result = jax.jit(sejax.make_learner(configuration.learn_config(config)))(jax.random.key(4))
-    mine = made[made["seed"] == 4]
-    np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
+    incumbents = made[made["seed"] == 4]["incumbent_mean"]
+    np.testing.assert_allclose(incumbents, result.info.incumbent_mean, rtol=1e-6)
+    stored = sejax.load_set(tmp_path / "ses.safetensors")
     assert stored.seeds.tolist() == [3, 4]
-    weights = stored[1].params.weights
-    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, weights, result.weights)))
+    assert_equal(stored[1].params.weights, result.weights)
     assert stored.scores[1] == pytest.approx(float(result.score))
-    with pytest.raises(ConfigError, match=r"agent_hparams.*Set work=DIR"):
-        learned(agent_hparams="varied")
+    assert refused(learned, generations=2) == "generations"
+    assert refused(learned, agent_hparams="varied") == "run_dir"
     assert refused(learned, run=["proxy=rn"]) == "run.proxy"
 
 
@@ -132,14 +127,10 @@ def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
 def test_the_density_is_that_of_reflected_kernels():
     values, low, high = np.array([8.0, 50, 50, 200]), 8.0, 200.0
     grid = np.linspace(low, high, 4001)
-    made = figures.density(values, grid, low, high)
-    assert np.trapezoid(made, grid) == pytest.approx(1, abs=1e-3)
+    assert np.trapezoid(figures.density(values, grid, low, high), grid) == pytest.approx(1, 1e-3)
     width = values.std() * 4 ** (-1 / 5)
-    expected = sum(
-        np.exp(-0.5 * ((30 - centre) / width) ** 2) / (4 * width * np.sqrt(2 * np.pi))
-        for v in values
-        for centre in (v, 2 * low - v, 2 * high - v)
-    )
+    centres = np.concatenate([values, 2 * low - values, 2 * high - values])
+    expected = scipy.stats.norm.pdf(30, centres, width).sum() / 4
     assert figures.density(values, [30.0], low, high)[0] == pytest.approx(expected)
     equal = figures.density(np.full(5, 200.0), grid, low, high)
     assert np.trapezoid(equal, grid) == pytest.approx(1, abs=1e-3) and np.argmax(equal) == 4000
@@ -147,43 +138,37 @@ def test_the_density_is_that_of_reflected_kernels():
 
 @pytest.mark.slow
 def test_performance_trains_as_evaluation_does(ses, tmp_path, tiny_agents):
-    given = {"num_agents": 3, "num_ses": 2}
-    table = run("se_performance", se_performance, tmp_path, fixed=ses, **given)
+    """Agents of the second groups are those of `make_evaluator` with the same keys and draws."""
+    table = run("se_performance", se_performance, tmp_path, fixed=ses, num_agents=3, num_ses=2)
     rows = shards.read_rows(tmp_path / "rows.csv.xz")
     assert rows.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
     assert table["trained on"].tolist() == ["real", "synth., HPs fixed"]
-    check_as_evaluation(ses, rows)
-    # Agents of equal number draw equal hyperparameters in all settings.
-    real, fixed = (rows[rows["setting"] == name] for name in ("real", "fixed"))
-    for name in ("learning_rate", "batch_size", "hidden_size", "num_layers"):
-        np.testing.assert_array_equal(real[name], fixed[name])
-        assert real[name].nunique() > 1
+    np.testing.assert_allclose(rows["return_0"] + rows["return_1"], 2 * rows["test_return"])
+    on_se, on_task = (rows[rows["setting"] == name] for name in ("fixed", "real"))
+    assert (on_se["train_steps"] == 40).all()
 
-
-def check_as_evaluation(ses, rows):
-    """Agents of the second groups are those of `make_evaluator` with the same keys and draws."""
-    loaded, task = sejax.load_set(ses), envs.make("cartpole")
+    one, task = sejax.load_set(ses)[1], envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
-    training = paper_training(max_steps=40, stop_rule="never", test_episodes=2)
-    expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
-    np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
-    assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
-    mine = rows[rows["group"] == "real-01"]
-    training = sejax.TrainingConfig(max_episodes=3, max_steps=4000, stop_rule="solved",
-                                    solved_by="train", test_episodes=2)  # fmt: skip
-    expected = evaluated(task.env, task.params, task, training, keys)
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
-    np.testing.assert_array_equal(mine["train_steps"], expected.train_steps)
-
-
-def evaluated(env, params, task, training, keys):
-    """Outcomes of agents that draw their hyperparameters, one after another."""
-    varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
-    evaluate = sejax.make_evaluator(varied, env, task, training)
-    return jax.jit(lambda keys: jax.lax.map(lambda key: evaluate(key, params), keys))(keys)
+    agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
+    limits = {"max_episodes": 3, "max_steps": 4000, "stop_rule": "solved", "solved_by": "train"}
+    for group, mine, env, params, training in (
+        (f"se-08-{one.fingerprint}", on_se, one.env, one.params,
+         paper_training(max_steps=40, stop_rule="never", test_episodes=2)),
+        ("real-01", on_task, task.env, task.params,
+         sejax.TrainingConfig(**limits, test_episodes=2)),
+    ):  # fmt: skip
+        evaluate = functools.partial(
+            sejax.make_evaluator(agent, env, task, training), env_params=params
+        )
+        expected = jax.jit(lambda keys, run=evaluate: jax.lax.map(run, keys))(keys)
+        found = mine[mine["group"] == group]
+        np.testing.assert_allclose(found["test_return"], expected.test_return, rtol=1e-6)
+        np.testing.assert_array_equal(found["train_steps"], expected.train_steps)
+    # Agents of equal number draw equal hyperparameters in all settings.
+    for name in ("learning_rate", "batch_size", "hidden_size", "num_layers"):
+        np.testing.assert_array_equal(on_task[name], on_se[name])
+        assert on_task[name].nunique() > 1
 
 
 def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):

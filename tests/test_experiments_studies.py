@@ -58,24 +58,17 @@ def test_the_search_is_the_bilevel_loop(monkeypatch):
     init, advance = score_transforms.make_search("single_best", True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
     state = start = init(keys, sizes)
-    config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
-                           "es.mirrored=true", "es.population_size=2"])  # fmt: skip
-    program = make_bilevel(**config.parts())
-
-    @jax.jit
-    def started(keys):
-        state = jax.vmap(program.init)(keys)
-        return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
-
-    expected, generation = started(keys), jax.jit(jax.vmap(program.generation))
+    words = ["es.score_transform=single_best", "es.mirrored=true", "es.population_size=2"]
+    program = make_bilevel(**sejax.config([*score_transforms.SETTINGS, *words]).parts())
+    expected = jax.jit(jax.vmap(program.init))(keys)
+    es_state = expected.es_state.replace(step_size=jnp.asarray(sizes))
+    expected, generation = expected.replace(es_state=es_state), jax.vmap(program.generation)
     for _ in range(2):
-        state = advance(state)
-        expected, _ = generation(expected)
+        state, (expected, _) = advance(state), jax.jit(generation)(expected)
     for new, old in zip(jax.tree.leaves(state), jax.tree.leaves(start), strict=True):
         assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
-    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4,
-                               atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
 
 
 def test_the_best_bin_and_the_ranks_are_those_of_the_means():

@@ -1,12 +1,10 @@
 """experiments.common.statistics: against scipy, and what is worked out by hand."""
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy.stats
 
 from experiments.common.statistics import difference_interval, mean_interval, worst_tenth
-from experiments.common.tables import mean_columns
 
 
 @pytest.mark.parametrize("size", [5, 6, 10, 33])
@@ -17,13 +15,6 @@ def test_intervals_are_those_of_scipys_t_tests(size):
     others = np.random.default_rng(0).normal(size=7)
     welch = scipy.stats.ttest_ind(values, others, equal_var=False).confidence_interval()
     assert difference_interval(values, others) == pytest.approx(tuple(welch))
-
-
-def test_columns_have_the_interval_over_the_means_of_groups():
-    values = np.random.default_rng(0).normal(size=(8, 6))
-    groups = pd.Series(np.repeat(range(8), 6))
-    column = mean_columns(pd.Series(values.ravel()), "x", groups)
-    assert column["x_low"] == pytest.approx(mean_interval(values.mean(axis=1))[0])
 
 
 def test_fewer_than_five_values_have_no_interval():
