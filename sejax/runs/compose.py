@@ -102,7 +102,7 @@ def compose(
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
     given, stored = read(overrides), stored or {}
-    imports = imports_of(overrides)
+    imports = frozenset(registry.paths_in(overrides))
     of_stored = {group: x["name"] for group, x in stored.items() if group in schema.groups}
     usual: dict[str, Any] = DEFAULTS | of_stored
     chosen = {name: given.get(name, usual[name]) for name in schema.groups}
@@ -207,13 +207,6 @@ def _choice(name: str) -> str:
     return group if group in registry.GROUPS else name
 
 
-def imports_of(overrides: Sequence[str]) -> frozenset[str]:
-    """Each `module:attribute` that words name, by itself or in a list."""
-    texts = (parsed(override.partition("=")[2]) for override in overrides)
-    items = itertools.chain.from_iterable(map(_as_list, texts))
-    return frozenset(x for x in items if isinstance(x, str) and ":" in x)
-
-
 def meant(words: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
     name, *values = [*filter(None, (word.strip("-=") for word in words[:3])), "VALUE"]
@@ -287,7 +280,8 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     chosen: dict[str, str] = {}
     for field, value in asked.items():
         names = parsed(value) if isinstance(value, str) else value
-        names = [x if isinstance(x, str) else as_text(x) for x in _as_list(names)]
+        names = names if isinstance(names, list) else [names]
+        names = [x if isinstance(x, str) else as_text(x) for x in names]
         got = shortened(value)
         several = shortened(",".join(dict.fromkeys([*chosen.values(), *names])))
         require(names, field, f"must hold an agent; got {got}. Set agents=[ddqn,ppo].")
@@ -297,10 +291,6 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     by_key = re.compile(r"agents\.([\w-]+)\.name")
     named = {match[1]: str(x) for name, x in given.items() if (match := by_key.fullmatch(name))}
     return chosen | named
-
-
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 # --- help ----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 from sejax import agents, envs
 from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
-from sejax.options import registry, require, shortened
+from sejax.options import ConfigError, registry, require, shortened
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, ProxySet, load_proxy, training_of
 from sejax.runs import config as configuration
@@ -53,13 +53,12 @@ class Setup:
 
 def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
-    require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
-    task_config = registry.configure("env", {"name": config.env})
+    if config.env is None:
+        raise ConfigError("env must be given with proxy=real. Set env=cartpole.", "env")
+    task = envs.make(config.env)
     for key, agent in config.agents.items():
         with errors_of("agent", config.field_of(key)):
-            spec = envs.spec_of(task_config)
-            agents.require_fit(agent, config.exploration, spec, str(config.env))
-    task = envs.make_from(task_config)
+            agents.require_fit(agent, config.exploration, task, task.name)
     trainings = dict.fromkeys(config.agents, config.real_training)
     return Setup(
         task=task,
