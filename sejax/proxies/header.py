@@ -233,8 +233,8 @@ def read(
       single: whether it must hold one proxy.
 
     Raises:
-      ConfigError: if there is no such file, it is damaged or of another format, or it holds a set or
-        proxies of another kind.
+      ConfigError: if there is no such file, it is damaged or of another format, or it holds a set
+        or proxies of another kind.
     """
     path = find(source, option)
     where = shortened(path, 60)
