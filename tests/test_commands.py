@@ -19,21 +19,16 @@ from support import ended, refusal
 
 import sejax
 from sejax import __main__ as program
+from sejax.ops.files import cache_folder
 from sejax.options.plain import expanded
 from sejax.runs import commands, runtime
 
 
 def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
-    def nobodys_home():
-        raise RuntimeError("Could not determine home directory.")
-
-    changed = []
-    monkeypatch.delenv("SEJAX_CACHE_DIR", raising=False)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(runtime.Path, "home", nobodys_home)
-    monkeypatch.setattr(jax.config, "update", lambda *change: changed.append(change))
-    runtime.configure_jax()
-    assert not [name for name, _ in changed if "cache" in name]
+    for name in ("SEJAX_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", MagicMock(side_effect=RuntimeError("nobody's home")))
+    assert cache_folder() is None
 
 
 @pytest.mark.parametrize(
@@ -49,11 +44,7 @@ def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, capsys, tmp_pa
     shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "stdout", shown)
-
-    def main():
-        commands.start(lambda overrides: print("12.0 ± 4.8"), str)
-
-    ended(monkeypatch, capsys, main)
+    ended(monkeypatch, capsys, lambda: commands.start(lambda _: print("12.0 ± 4.8"), str))
     shown.flush()
     assert shown.buffer.getvalue() == b"12.0 \\xb1 4.8\n"
 
@@ -72,22 +63,14 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
 # --- what people type ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("words", "meant"),
-    [
-        (["--env", "cartpole"], "Write env=cartpole, without dashes."),
-        (["--env=cartpole", "seed=1"], "Write env=cartpole, without dashes."),
-        (["-agent"], "Write agent=VALUE, without dashes."),
-        (["--seed", "env=cartpole"], "Write seed=VALUE, without dashes."),
-    ],
-)
+@pytest.mark.parametrize(("words", "meant"), [
+    (["--env", "cartpole"], "env=cartpole,"), (["--env=cartpole", "seed=1"], "env=cartpole,"),
+    (["-agent"], "agent=VALUE,"), (["--seed", "env=cartpole"], "seed=VALUE,"),
+])  # fmt: skip
 def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words, meant):
-    def main():
-        commands.start(print, str)
-
+    main = functools.partial(commands.start, print, str)
     status, _, said = ended(monkeypatch, capsys, main, *words)
-    assert status == commands.BAD_INPUT and said.count("\n") == 1
-    assert said.startswith("error: an override must read FIELD=VALUE;") and meant in said
+    assert status == commands.BAD_INPUT and said.count("\n") == 1 and f"Write {meant}" in said
 
 
 @pytest.mark.parametrize("words", [[], ["--help"]])
@@ -136,11 +119,8 @@ def test_an_error_in_code_of_ones_own_ends_with_its_place(monkeypatch, capsys, t
 
 
 def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
-    def main():
-        commands.start(functools.partial(int, "x"), str)
-
     with pytest.raises(TypeError):
-        ended(monkeypatch, capsys, main)
+        ended(monkeypatch, capsys, functools.partial(commands.start, int, str), "x")
 
 
 def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
@@ -165,10 +145,8 @@ def test_a_platform_that_jax_lacks_is_one_line_with_the_variable(platform, tmp_p
         words, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": platform}
     )
     assert ended.returncode == commands.BAD_INPUT and not (tmp_path / "run").exists()
-    assert ended.stderr.splitlines()[-1] == (
-        "error: JAX_PLATFORMS must name what jax was installed for and finds here; got "
-        f"{platform}. Set JAX_PLATFORMS=cpu."
-    )
+    *_, last = ended.stderr.splitlines()
+    assert last.startswith("error: JAX_PLATFORMS must") and last.endswith("JAX_PLATFORMS=cpu.")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import struct
 import types
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -48,14 +49,11 @@ def generation(number):
     )
 
 
-@pytest.mark.parametrize(
-    ("fails", "reason", "calls"),
-    [
-        ("make", "SystemExit: no account", ["make"]),
-        ("on_generation", "OSError: cannot on_generation", ["make", "on_generation", "close"]),
-        ("close", "OSError: cannot close", ["make", "on_generation", "on_generation", "close"]),
-    ],
-)
+@pytest.mark.parametrize(("fails", "reason", "calls"), [
+    ("make", "SystemExit: no account", ["make"]),
+    ("on_generation", "OSError: cannot on_generation", ["make", "on_generation", "close"]),
+    ("close", "OSError: cannot close", ["make", "on_generation", "on_generation", "close"]),
+])  # fmt: skip
 def test_a_tracker_that_fails_is_dropped_with_one_message(tmp_path, fails, reason, calls):
     listener, said = Listener(fails), []
     tracker = GuardedTracker(listener, tracked_run(tmp_path), said.append)
@@ -68,13 +66,9 @@ def test_a_tracker_that_fails_is_dropped_with_one_message(tmp_path, fails, reaso
 
 
 def test_ctrl_c_is_not_taken_for_a_failure(tmp_path):
-    class Interrupted(Listener):
-        def on_generation(self, info):
-            raise KeyboardInterrupt
-
-    tracker = GuardedTracker(Interrupted(), tracked_run(tmp_path), print)
+    config = MagicMock(make=MagicMock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        tracker.on_generation(generation(0))
+        GuardedTracker(config, tracked_run(tmp_path), print).on_generation(generation(0))
 
 
 # --- the real ones -------------------------------------------------------------------------------

@@ -103,16 +103,7 @@ def run(
     report, learner = report or Reporter(), chunks.learner
     start_wall_s = directory.wall_s - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
-    state = chunks.init(jax.random.key(config.seed))
-    restored = directory.restore(state)
-    best_on_disk = None
-    if restored is not None:
-        # `stop_when_solved` may have changed.
-        solved = jax.numpy.bool_(learner.is_solved(restored.best_score))
-        state = dataclasses.replace(restored, solved=solved)
-        _say_what_is_resumed(directory, report)
-        best_on_disk = save_proxies(directory, learner, jax.device_get(state), best_on_disk)
-    state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
+    state, best_on_disk = _begin(config, directory, chunks, report)
     tracked = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,
@@ -121,12 +112,9 @@ def run(
     )
     drawn = time.monotonic()
     with contextlib.closing(GuardedTracker(config.tracker, tracked, report.say)) as tracker:
-        while directory.finished_generations < config.generations and not state.solved:
-            if _all_diverged(directory, learner):
-                break
+        while (ended := _ended(config, directory, learner, state)) is None:
             left = config.generations - directory.finished_generations
-            length = min(config.checkpoint_every, left)
-            state, info = _advance(chunks, state, length, report)
+            state, info = _advance(chunks, state, min(config.checkpoint_every, left), report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
                 wall_s = start_wall_s + time.monotonic()
@@ -140,8 +128,6 @@ def run(
                 draw(directory, learner)
                 drawn = time.monotonic()
         draw(directory, learner)
-    diverged = _all_diverged(directory, learner)
-    ended = "solved" if state.solved else "diverged" if diverged else "finished"
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
@@ -149,11 +135,40 @@ def run(
         wall_s=round(start_wall_s + time.monotonic(), 1),
         cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
         **_costs(directory, learner),
-        devices=[str(device) for device in jax.devices()],
-        machine=runtime.machine(),
-        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
+        **_machine(),
     )
     return ended
+
+
+def _begin(
+    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter
+) -> tuple[LearnState, int | None]:
+    """A new state or that of the folder, and the generation of the best proxy that is written."""
+    state, best_on_disk = chunks.init(jax.random.key(config.seed)), None
+    restored = directory.restore(state)
+    if restored is not None:
+        report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
+        here = runtime.versions()
+        if directory.versions != here:
+            made = f"It was made with {directory.versions}; here are {here}"
+            report.say(f"{made}. Numbers may move.")
+        # `stop_when_solved` may have changed.
+        solved = jax.numpy.bool_(chunks.learner.is_solved(restored.best_score))
+        state = dataclasses.replace(restored, solved=solved)
+        best_on_disk = save_proxies(directory, chunks.learner, jax.device_get(state), None)
+    # Buffers of its own, so that they can be donated.
+    return jax.tree.map(lambda x: x.copy(), state), best_on_disk
+
+
+def _ended(
+    config: LearnConfig, directory: RunDirectory, learner: Bilevel, state: LearnState
+) -> str | None:
+    """How the run has ended; None if it has not."""
+    if state.solved:
+        return "solved"
+    if _all_diverged(directory, learner):
+        return "diverged"
+    return "finished" if directory.finished_generations >= config.generations else None
 
 
 def _advance(
@@ -171,13 +186,6 @@ def _advance(
     return state, info
 
 
-def _say_what_is_resumed(directory: RunDirectory, report: Reporter) -> None:
-    report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
-    here = runtime.versions()
-    if directory.versions != here:
-        report.say(f"It was made with {directory.versions}; here are {here}. Numbers may move.")
-
-
 def _costs(directory: RunDirectory, learner: Bilevel) -> dict[str, int]:
     """What all sessions of a run took, as counts."""
     agents = learner.strategy.num_evaluations  # of a generation
@@ -187,6 +195,15 @@ def _costs(directory: RunDirectory, learner: Bilevel) -> dict[str, int]:
         "agents": directory.finished_generations * agents,
         "train_steps": round(steps_of_agents * agents),
         "real_steps": directory.real_steps,
+    }
+
+
+def _machine() -> dict[str, Any]:
+    """Where this session has computed, and with what."""
+    return {
+        "devices": [str(device) for device in jax.devices()],
+        "machine": runtime.machine(),
+        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     }
 
 
