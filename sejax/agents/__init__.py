@@ -25,6 +25,7 @@ from sejax.agents.buffers import (
     replay_buffer,
     rollout_buffer,
 )
+from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
 from sejax.options import nearest, registry, require, shortened
@@ -100,8 +101,6 @@ def _make_agent(
     spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
     if not varied:
         return make(config)
-    from sejax.agents.varied import make_varied
-
     return make_varied(config, make)
 
 

@@ -29,7 +29,8 @@ def inverse_of_flatten(shapes: PyTree) -> Callable[[Array], PyTree]:
 
     def unflatten(vector: Array) -> PyTree:
         parts = zip(jax.lax.split(vector, [leaf.size for leaf in leaves]), leaves, strict=True)
-        return structure.unflatten([x.reshape(leaf.shape).astype(leaf.dtype) for x, leaf in parts])
+        arrays = [x.reshape(leaf.shape).astype(leaf.dtype) for x, leaf in parts]
+        return jax.tree.unflatten(structure, arrays)
 
     return unflatten
 
