@@ -16,7 +16,7 @@ from support import printed, refused
 
 import sejax
 from sejax import envs
-from sejax.distillation.config import read
+from sejax.distill import read
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
