@@ -20,8 +20,7 @@ import sejax
 from experiments.common import agents, figures, tables
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
-from sejax.distillation import distilling
-from sejax.distillation.config import read
+from sejax import distill
 from sejax.options import each_of
 
 QUICK = (
@@ -63,17 +62,17 @@ def compute(settings: SeDistilled) -> pd.DataFrame:
 
 def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
     """Rows of the command with one seed, a cached shard."""
-    own, config = read(settings.words(seed))
+    own, config = distill.read(settings.words(seed))
     config = dataclasses.replace(config, devices=settings.devices)
     folder = settings.work_folder / f"seed{seed}"
 
     def run() -> pd.DataFrame:
         folder.mkdir(parents=True, exist_ok=True)
-        distilling.distill(own, config, folder, shlex.join(settings.words(seed)))
+        distill.distill(own, config, folder, shlex.join(settings.words(seed)))
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    return settings.shards.compute(f"seed{seed}", distilling.asked(own, config), run)
+    return settings.shards.compute(f"seed{seed}", distill.asked(own, config), run)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -82,7 +81,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     found = []
     for seed, mine in students.groupby("seed"):
         search = searches[searches["seed"] == seed]
-        tested = mine[mine["use"] == distilling.TEST]
+        tested = mine[mine["use"] == distill.TEST]
         for kind, returns in tested.groupby("agent", sort=False)["test_return"]:
             each = returns.fillna(returns.min())
             found.append(
@@ -123,7 +122,7 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
             for x in mine.itertuples()
         }
         shown.append(costs | cells)
-    own, config = read(settings.words(settings.seed))
+    own, config = distill.read(settings.words(settings.seed))
     search = own.search
     note = (
         f"Each row is a run of `python -m sejax.distill`: {search.num_starts} searches begin with "
@@ -140,7 +139,7 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
 def draw(settings: SeDistilled, rows: pd.DataFrame, path: Path) -> None:
     """Draws what the students of every policy reached against what the policy itself reaches."""
     students = unstack(rows, "students")
-    chosen_by = students[students["use"] == distilling.CHOOSE]
+    chosen_by = students[students["use"] == distill.CHOOSE]
     kinds, task = list(dict.fromkeys(students["agent"])), sejax.envs.make(settings.env)
     size = (0.6 + 2.6 * len(kinds), 2.9)
     with figures.panels(path, 1, len(kinds), size, sharex=True, sharey=True) as (_, axes):

@@ -1,66 +1,248 @@
-"""`python -m sejax.distill`: an SE made of a policy, chosen by the agents that it teaches."""
+"""Make an SE of a policy, and choose it by what it teaches.
 
+  python -m sejax.distill env=pendulum policy=ppo:model.zip    a model of Stable-Baselines3
+  python -m sejax.distill env=cartpole policy=my_module:act    a function of observations
+  python -m sejax.distill env=cartpole policy=ppo              an agent of sejax, which is trained
+  python -m sejax.distill env=halfcheetah agents=[td3,sac,ppo] search.generations=200
+
+A copy of the policy, a small network, becomes the reward of a one-step SE. Without `policy` linear
+ones are found by augmented random search: the best of each part of the search becomes an SE,
+students train on each, and the SE that teaches best is kept. Other fields are those of sejax.run
+with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv into run_dir;
+the same command goes on where it was stopped.
+"""
+
+import dataclasses
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
-from sejax.distillation.config import DistillConfig, folder_of, read
-from sejax.distillation.policy_copy import CopyConfig
-from sejax.distillation.policy_search import SearchConfig
-from sejax.ops.files import FolderLock
-from sejax.options import as_text, help_texts, require
-from sejax.options.plain import fields_of, flatten, to_plain
+import jax
+import pandas as pd
+
+from sejax import envs
+from sejax.distillation.policies import CopyConfig, copied
+from sejax.distillation.policy_search import SearchConfig, searched
+from sejax.distillation.teaching import counted, grades, students
+from sejax.ops.files import as_file_name, write_text
+from sejax.options import Options, as_text, counts, help_texts, option, require
+from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
+from sejax.proxies import header, zoo
+from sejax.proxies.exact import make_exact
+from sejax.proxies.io import save
 from sejax.runs import commands, runtime
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
+from sejax.runs.store import Store
 
-ABOUT = """Make an SE of a policy, and choose it by what it teaches.
+# Fields of sejax.run that have an effect here.
+TAKEN = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices",
+         "run_dir"}  # fmt: skip
+# Students where none are named, and how long they train.
+STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
+STEPS = {"continuous": "10000", "discrete": "2000"}
+CHECKPOINT = "checkpoint"  # the entry that a run's folder has too
+CHOOSE, TEST = "choose", "test"  # what students are for
 
-  python -m sejax.distill env=hopper
-  python -m sejax.distill env=halfcheetah agents=[td3,sac,ppo] search.generations=200
-  python -m sejax.distill env=pendulum policy=sac:model.zip
 
-A linear policy is found by augmented random search. The best policies of parts of the search become
-SEs; students train on each, and the SE that teaches best is kept. With `policy`, that one is used.
-Other fields are those of sejax.run with preset=distilled. Writes proxy.safetensors, card.md,
-search.csv and students.csv into run_dir; the same command goes on with a search that was stopped.
-"""
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig(Options):
+    """The fields of `python -m sejax.distill`; all others are those of `sejax.run`."""
+
+    group: ClassVar[str] = ""
+
+    # ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax, such as
+    # ppo. null: a linear policy is searched.
+    policy: str | None = None
+    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)  # of a given policy
+    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)  # of a linear policy
+    # Whether the numbers of an initial state are independent; else they have the visited states'
+    # covariance.
+    independent_starts: bool = False
+    # Policies that are taught: the best tested one of each of so many equal parts of the search.
+    num_snapshots: int = option(6, counts("something must be taught"))
+    # Students of each agent on the SE of each policy, which choose one of the SEs.
+    num_students: int = option(4, counts("an SE is chosen by what it teaches"))
+    # Others of each agent, on the chosen SE.
+    num_tested: int = option(10, counts("a card says what an SE teaches"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        num_tests = -(-self.search.generations // self.search.test_every)
+        require(
+            self.policy is not None or self.num_snapshots <= num_tests,
+            "num_snapshots",
+            f"must be at most {num_tests}, as many policies as the search tests; got "
+            f"{self.num_snapshots}. Set search.test_every=1.",
+        )
 
 
 def main(overrides: Sequence[str]) -> None:
     """Distils as the overrides say.
 
     Raises:
-      ConfigError: for overrides that cannot be, or a folder of another search.
+      ConfigError: for overrides that cannot be, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    from sejax.distillation import distilling
-
     own, config = read(overrides)
     runtime.configure_jax()
     folder = folder_of(own, config)
-    require(
-        not (folder / "checkpoint.safetensors").exists(),
-        "run_dir",
-        f"must not be a run of sejax.run, whose proxy would be lost; got {folder}. Set "
-        "run_dir=FOLDER.",
-    )
-    lock = FolderLock(folder, "Set run_dir=FOLDER.")
     try:
-        distilling.distill(own, config, folder, shlex.join(overrides))
+        distill(own, config, folder, shlex.join(overrides))
     except KeyboardInterrupt as stop:
         commands.interrupted(f"Interrupted. The same command goes on from {folder}.", stop)
-    finally:
-        lock.release(is_used=(folder / distilling.ASKED).exists())
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     texts = dict(help_texts(DistillConfig))
     for part in (CopyConfig, SearchConfig):
-        texts |= {f"{part.group}.{name}": x for name, x in help_texts(part).items()}
+        texts |= {f"{part.group}.{name}": text for name, text in help_texts(part).items()}
     lines = [
         f"  {name}={as_text(default)}" + (f"  # {texts[name]}" if name in texts else "")
         for name, default in flatten(to_plain(fields_of(DistillConfig))).items()
     ]
-    return "\n".join([ABOUT, "Its own fields, with their defaults:", *lines])
+    return "\n".join([str(__doc__), "Its own fields, with their defaults:", *lines])
+
+
+def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
+    """The command's fields, and a configuration of task, students and trainings.
+
+    Raises:
+      ConfigError: for overrides that cannot be.
+    """
+    values: dict[str, Any] = {}
+    others = []
+    for override in overrides:
+        name, _, text = override.partition("=")
+        first, _, last = name.partition(".")
+        if first in fields_of(DistillConfig):
+            values = merge(values, {first: {last: text}} if last else {first: text})
+        else:
+            fix = "Set search.generations=N." if name == "generations" else "Leave it out."
+            require(first in TAKEN, name, f"must be left out, as it has no effect here. {fix}")
+            others.append(override)
+    task = configuration.config([word for word in others if word.startswith(("env=", "env."))])
+    kind = envs.spec_of(task.env).actions
+    given = dict(word.partition("=")[::2] for word in others)
+    steps = given.get("training.max_steps", STEPS[kind])
+    # An episode of a one-step SE is a step.
+    defaults = ["preset=distilled", f"training.max_steps={steps}", f"training.max_episodes={steps}"]
+    if not given.keys() & {"agent", "agents"}:
+        defaults.append(f"agents={STUDENTS[kind]}")
+    unsaid = [word for word in defaults if word.partition("=")[0] not in given]
+    config = configuration.config([*unsaid, *others])
+    # The task's reward for being healthy is left out of searches.
+    bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
+    return from_plain(DistillConfig, merge(bonus, values), ""), config
+
+
+def folder_of(own: DistillConfig, config: LearnConfig) -> Path:
+    """The command's folder: `run_dir`, or one named by task, given policy and seed."""
+    algorithm, _, path = (own.policy or "").rpartition(":")
+    parts = ["distill", config.name("env"), algorithm, Path(path).stem, f"s{config.seed}"]
+    return Path(config.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
+
+
+# --- what the command does ------------------------------------------------------------------------
+
+
+def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
+    """Finds policies, teaches them, and writes the SE that teaches best.
+
+    Args:
+      own: how policies are found, and how many students there are.
+      config: task, students and their trainings, and seed.
+      folder: where files are written; what was finished there is not done again.
+      words: the command's overrides, for the card.
+
+    Returns:
+      The SE's file.
+
+    Raises:
+      ConfigError: for a folder of another command, or a policy that cannot be.
+      OSError: if a file cannot be written.
+    """
+    with Store(folder, asked(own, config)) as store:
+        return _distilled(own, config, store, words)
+
+
+def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
+    task, folder = config.task(), store.folder
+    store.get(CHECKPOINT)  # which refuses a folder of another command
+    uses = ("search", "nothing", "record", CHOOSE, TEST)  # policies are tested by the last one too
+    keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
+    if own.policy is None:
+        num_lessons = own.num_snapshots
+        lessons, costs = searched(own.search, task, num_lessons, keys, store, config.devices)
+        write_text(folder / "search.csv", costs.to_csv(index=False))
+    else:
+        lessons, costs = copied(own.copy, task, own.policy, keys, own.independent_starts)
+    store.put(CHECKPOINT)
+    made = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
+    env, weights = made[0][0], [weights for _, weights in made]
+    best, rows = 0, pd.DataFrame()
+    if len(lessons) > 1:
+        own_keys = jax.random.split(keys[CHOOSE], own.num_students)
+        rows = students(env, weights, lessons, config, own_keys, store).assign(use=CHOOSE)
+        marks = grades(rows)
+        print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
+        best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
+    own_keys = jax.random.split(keys[TEST], own.num_tested)
+    tested = students(env, [weights[best]], [lessons[best]], config, own_keys, store)
+    rows = pd.concat([rows, tested.assign(use=TEST)])
+    write_text(folder / "students.csv", rows.to_csv(index=False))
+    plain = configuration.plain(config)
+    spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
+    path = folder / "proxy.safetensors"
+    save(
+        path,
+        env,
+        weights[best],
+        {name: value for name, value in plain.items() if name not in ("env", "proxy")},
+        generation=lessons[best].generation,
+        seed=config.seed,
+        policy_return=lessons[best].policy_return,
+        evaluations=evaluations_of(tested),
+        learning={
+            "command": f"python -m sejax.distill {words}".rstrip(),
+            "generations": own.search.generations if own.policy is None else 0,
+            "real_steps": int(spent["real_steps"]),
+            "agents": len(rows),
+            "train_steps": int(rows["train_steps"].sum()),
+            "cpu_s": round(float(spent["cpu_s"]), 1),
+        },
+    )
+    write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
+    print(
+        f"{path} holds the SE of generation {lessons[best].generation}: "
+        f"{spent['real_steps']:,.0f} real steps, {spent['cpu_s']:,.0f} CPU s."
+    )
+    return path
+
+
+def asked(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+    """What the numbers depend on, as plain values."""
+    plain = configuration.plain(config)
+    return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
+
+
+def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """What fresh students of each agent reach, as the SE's file keeps it."""
+    return [
+        {
+            "agent": agent,
+            "hparams": "as_learned",
+            "world": "proxy",
+            "num_agents": len(students),
+            "return_mean": float(counted(students["test_return"]).mean()),
+            "return_std": float(counted(students["test_return"]).std(ddof=0)),
+            "train_steps": float(students["train_steps"].mean()),
+        }
+        for agent, students in rows.groupby("agent", sort=False)
+    ]
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from support import ended, printed, refusal
 
 import sejax
 from sejax import distill, envs, evaluate, run
-from sejax.distillation.config import DistillConfig
+from sejax.distill import DistillConfig
 from sejax.options import ConfigError, registry
 from sejax.options.plain import flatten, parsed
 from sejax.runs import commands, preset_files

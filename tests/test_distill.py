@@ -8,131 +8,26 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from support import refusal, refused
+from support import refused
 
 import sejax
-from sejax.distill import main
-from sejax.distillation import distilling
-from sejax.distillation.config import folder_of, read
-from sejax.ops import checksummed
-from sejax.options import ConfigError
+from sejax.distill import folder_of, main, read
+from sejax.distillation import teaching
 from sejax.proxies import header, zoo
 
 QUICK = (
-    *("env=cartpole", "devices=1", "search.num_directions=4", "search.num_top=2"),
-    *("search.generations=4", "search.test_every=1", "search.num_tests=2", "num_snapshots=2"),
-    *("search.num_starts=2", "search.start_generations=2"),
-    *("num_students=2", "num_tested=2", "training.max_steps=60", "training.max_episodes=60"),
-    *("training.test_episodes=2", "agent=ddqn"),
+    *("env=cartpole", "agent=ddqn", "devices=1", "num_students=2", "num_tested=2"),
+    *("search.num_directions=4", "search.num_top=2", "search.generations=4", "num_snapshots=2"),
+    *("search.test_every=1", "search.num_tests=2", "search.num_starts=2"),
+    *("search.start_generations=2", "training.max_steps=60", "training.test_episodes=2"),
+    *("copy.episodes=2", "copy.steps=300", "copy.hidden_size=4"),
 )
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("distilled") / "run"
-    main([*QUICK, f"run_dir={path}"])
-    return path
-
-
-def test_it_writes_an_se_that_says_what_it_is(folder):
-    shown = zoo.describe(header.read(folder))
-    curve, rows = pd.read_csv(folder / "search.csv"), pd.read_csv(folder / "students.csv")
-    assert curve["generation"].tolist() == [1, 2, 1, 2, 3, 4]
-    best = int(curve["start"][curve["test_mean"].iloc[:4].idxmax()])
-    assert curve["start"].tolist() == [0, 0, 1, 1, best, best]
-    assert rows.groupby(["use", "agent"]).size().to_dict() == {
-        ("choose", "ddqn"): 4,
-        ("test", "ddqn"): 2,
-    }
-    assert shown.is_distilled and shown.row["learned with"] == "a policy"
-    assert "| policy_return |" in (folder / "card.md").read_text()
-    tested = rows[rows["use"] == "test"].groupby("agent")["test_return"].mean()
-    assert {x.agent: x.return_mean for x in shown.evaluations} == pytest.approx(tested.to_dict())
-    # Searches, the recorded episodes, and all tests of students.
-    steps = curve["real_steps"].sum() + rows["real_steps"].sum()
-    assert shown.learning.real_steps == steps
-    assert shown.learning.train_steps == 6 * 60
-    assert rows["policy_return"][rows["use"] == "test"].unique() == [shown.policy_return]
-
-
-def test_the_se_that_teaches_best_is_kept(folder):
-    rows = pd.read_csv(folder / "students.csv")
-    chosen = rows[rows["use"] == "choose"].groupby(["generation", "agent"])["test_return"]
-    marks = ((chosen.mean() + chosen.min()) / 2).groupby("generation").mean()
-    assert sejax.load_proxy(folder).record["generation"] == marks.idxmax()
-    assert set(rows[rows["use"] == "test"]["generation"]) == {marks.idxmax()}
-
-
-@pytest.mark.parametrize("kept", [1, 2, 3, 5])  # tests, of both starts and of the one that went on
-def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path, kept):
-    tensors, manifest = checksummed.read(folder / distilling.CHECKPOINT, distilling.KIND)
-    half = {name: x[:kept] for name, x in tensors.items()}
-    manifest["rows"] = manifest["rows"][:kept]
-    packed = checksummed.pack(half, distilling.KIND, manifest)
-    (tmp_path / distilling.CHECKPOINT).write_bytes(packed)
-    main([*QUICK, f"run_dir={tmp_path}"])
-    names = ["use", "generation", "agent", "student", "test_return"]
-    one, two = (pd.read_csv(x / "students.csv")[names] for x in (folder, tmp_path))
-    pd.testing.assert_frame_equal(one, two)
-    assert sejax.load_proxy(folder).fingerprint == sejax.load_proxy(tmp_path).fingerprint
-
-
-def test_students_that_have_trained_do_not_train_again(folder, tmp_path, monkeypatch):
-    path, teach, calls = shutil.copytree(folder, tmp_path / "copy"), distilling.teaching.teach, []
-    shutil.rmtree(path / "students")
-    for name in ("students.csv", "proxy.safetensors"):
-        (path / name).unlink()
-
-    def killed(*args):
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-        calls.append(args)
-        return teach(*args)
-
-    monkeypatch.setattr(distilling.teaching, "teach", killed)
-    own, config = read([*QUICK, f"run_dir={path}"])
-    with pytest.raises(KeyboardInterrupt):
-        distilling.distill(own, config, path)
-    monkeypatch.setattr(distilling.teaching, "teach", lambda *x: calls.append(x) or teach(*x))
-    distilling.distill(own, config, path)
-    names = ["use", "generation", "agent", "student", "test_return"]
-    one, two = (pd.read_csv(x / "students.csv")[names] for x in (folder, path))
-    pd.testing.assert_frame_equal(one, two)
-    assert len(calls) == len(one.groupby(["use", "agent"]))  # each kind once
-
-
-def test_a_policy_whose_file_has_changed_gets_students_of_its_own(tmp_path):
-    path, kernel = tmp_path / "policy.npz", np.zeros((2, 4), np.float32)
-    words = [*QUICK, f"policy={path}", f"run_dir={tmp_path / 'run'}"]
-    for sign in (1.0, -1.0):
-        kernel[1] = sign * np.array([0, 0, 1.0, 0.6])
-        np.savez(path, kernel_0=kernel, bias_0=np.zeros(2, np.float32))
-        main(words)
-        rows = pd.read_csv(tmp_path / "run" / "students.csv")
-        shown = zoo.describe(header.read(tmp_path / "run"))
-        assert rows["policy_return"].unique() == pytest.approx([shown.policy_return])
-    assert len(list((tmp_path / "run" / "students").iterdir())) == 2
-
-
-def test_a_folder_of_another_command_is_left_alone(folder, tmp_path):
-    path = shutil.copytree(folder, tmp_path / "copy")
-    words = [*QUICK, f"run_dir={path}"]
-    for other, said in (
-        ("search.step_size=0.5", "search.step_size (0.02 there, 0.5 here)"),
-        (f"policy={__name__}:act", "policy (None there"),
-        ("agent=dqn", "with agent"),
-    ):
-        assert said in str(refusal(main, [*words, other]))
-    os.truncate(path / distilling.CHECKPOINT, 200)
-    assert "damaged" in str(refusal(main, words))
-    for text in ("", "a: ["):
-        (path / distilling.ASKED).write_text(text)
-        assert "must hold distill.yaml as it was written" in str(refusal(main, words))
+POLICY = f"policy={__name__}:act"
+SIGN = 1.0  # of the policy that a test distils by its name
 
 
 def act(obs):
-    """A policy that a test distils by its name."""
-    return (obs[:, 2] + 0.6 * obs[:, 3] > 0).astype(int)
+    return (SIGN * (obs[:, 2] + 0.6 * obs[:, 3]) > 0).astype(int)
 
 
 def of_another_shape(obs):
@@ -147,86 +42,143 @@ def fails(obs):
     return 1 // 0
 
 
-def test_a_run_of_another_command_is_not_overwritten(tmp_path):
-    (tmp_path / "checkpoint.safetensors").touch()
-    assert refused(main, [*QUICK, f"run_dir={tmp_path}"]) == "run_dir"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("distilled") / "run"
+    main([*QUICK, f"run_dir={path}"])
+    return path
 
 
-def test_files_of_other_things_are_refused(tmp_path):
-    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
-    np.savez(tmp_path / "turned.npz", kernel_0=np.zeros((4, 2)), bias_0=np.zeros(2))
-    for name in ("other", "turned"):
-        with pytest.raises(ConfigError, match="policy must"):
-            main([*QUICK, f"run_dir={tmp_path}/run", f"policy={tmp_path}/{name}.npz"])
+@pytest.fixture
+def copied(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
 
 
-def test_policies_come_from_files_and_functions(tmp_path, capsys):
-    layers = {"kernel_0": np.array([[0, 0, 0, 0], [0, 0.3, 1, 0.6]]), "bias_0": np.zeros(2)}
-    np.savez(tmp_path / "linear.npz", **layers)
-    words = [*QUICK, "copy.episodes=2"]
-    main([*words, f"policy={tmp_path}/linear.npz", f"run_dir={tmp_path}/run"])
-    assert "policy 200.0\n" in capsys.readouterr().out
-    assert sejax.load_proxy(tmp_path / "run").record["policy_return"] == 200.0
-    quick = ("copy.rounds=1", "copy.steps=20", "copy.hidden_size=4")
-    main([*words, *quick, f"policy={__name__}:act", f"run_dir={tmp_path}/other"])
-    assert "its copy" in capsys.readouterr().out
+def test_the_se_that_teaches_best_is_written_and_says_what_it_is(folder):
+    shown = zoo.describe(header.read(folder))
+    curve, rows = pd.read_csv(folder / "search.csv"), pd.read_csv(folder / "students.csv")
+    best = int(curve["start"][curve["test_mean"].iloc[:4].idxmax()])
+    assert curve["start"].tolist() == [0, 0, 1, 1, best, best]
+    assert curve["generation"].tolist() == [1, 2, 1, 2, 3, 4]
+    chosen, tested = (rows[rows["use"] == use] for use in ("choose", "test"))
+    by_se = chosen.groupby("generation")["test_return"]
+    assert len(by_se) == 2 and (by_se.size() == 2).all() and len(tested) == 2
+    assert shown.generation == ((by_se.mean() + by_se.min()) / 2).idxmax()
+    assert set(tested["generation"]) == {shown.generation}
+    assert set(tested["policy_return"]) == {shown.policy_return}
+    (evaluation,) = shown.evaluations
+    assert evaluation.return_mean == pytest.approx(tested["test_return"].mean())
+    assert shown.is_distilled and "| policy_return |" in shown.card
+    # Searches, the recorded episodes, and all tests of students.
+    assert shown.learning.real_steps == curve["real_steps"].sum() + rows["real_steps"].sum()
+    assert shown.learning.train_steps == 6 * 60
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "lost", ["search/start1-*", "search/*", "students/*", "search/start?-[23]*"]
+)
+def test_a_killed_command_goes_on_to_the_same_file(copied, folder, lost):
+    for path in [*copied.glob(lost), *copied.glob("*.csv"), copied / "proxy.safetensors"]:
+        path.unlink()
+    main([*QUICK, f"run_dir={copied}"])
+    one, two = (pd.read_csv(x / "students.csv").drop(columns="cpu_s") for x in (folder, copied))
+    pd.testing.assert_frame_equal(one, two)
+    assert sejax.load_proxy(folder).fingerprint == sejax.load_proxy(copied).fingerprint
+
+
+def test_a_finished_command_trains_nobody_again(copied, monkeypatch):
+    monkeypatch.setattr(teaching, "teach", lambda *_: pytest.fail("it trains"))
+    (copied / "proxy.safetensors").unlink()
+    main([*QUICK, f"run_dir={copied}"])
+    assert (copied / "proxy.safetensors").exists()
+
+
+@pytest.mark.parametrize("other", ["search.step_size=0.5", POLICY, "agent=dqn", "num_tested=3"])
+def test_a_folder_of_another_command_is_left_alone(folder, other):
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.*")}
+    assert refused(main, [*QUICK, f"run_dir={folder}", other]) == "run_dir"
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_damaged_files_and_runs_of_another_command_are_refused(copied):
+    words = [*QUICK, f"run_dir={copied}"]
+    os.truncate(next(copied.glob("search/*")), 200)
+    assert refused(main, words) == "run_dir"
+    (copied / "checkpoint.safetensors").write_bytes(b"")
+    assert refused(main, words) == "run_dir"
+
+
+def test_a_function_that_has_changed_gets_students_of_its_own(tmp_path, monkeypatch):
+    returns = []
+    for sign in (1.0, -1.0):
+        monkeypatch.setattr(sys.modules[__name__], "SIGN", sign)
+        main([*QUICK, POLICY, f"run_dir={tmp_path}"])
+        returns.append(zoo.describe(header.read(tmp_path)).policy_return)
+        assert pd.read_csv(tmp_path / "students.csv")["policy_return"].unique() == returns[-1:]
+    assert returns[0] == 200.0 > returns[1]
+    assert len(list((tmp_path / "students").iterdir())) == 2
+
+
+def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
+    main([*QUICK, "policy=ddqn", "copy.agent_steps=300", f"run_dir={tmp_path}"])
+    shown, rows = zoo.describe(header.read(tmp_path)), pd.read_csv(tmp_path / "students.csv")
+    assert shown.learning.real_steps > 300 + 2 * shown.policy_return + rows["real_steps"].sum()
+
+
+@pytest.mark.parametrize(
+    ("word", "field"),
     [
-        (["reward_form=quadratic"], "reward_form must be left out where actions are discrete"),
-        (["num_snapshots=5"], "num_snapshots must be at most 4"),
-        (["search.num_top=5"], "search.num_top must be at most search.num_directions"),
-        (["search.generationz=5"], "Did you mean search.generations"),
-        (["training.stop_rule=plateau"], "training.stop_rule must be never"),
-        (["policy=sac"], "policy must be a file or a function"),
-        (["policy=nothing.npz"], "policy must be a file of kernel_0"),
-        (["policy=nothing:act"], "policy must name a module that can be imported"),
-        (["policy=dqn:nothing.zip"], "policy must name an algorithm and a file"),
-        (["agent=nothing"], "agent must be one of"),
-        (["generations=5"], "generations must be left out .* Set search.generations=N"),
-        (["proxy.hidden_size=5"], "proxy.hidden_size must be left out"),
-        (["env=cliff_walking"], "must"),
-        ([f"policy={__name__}:of_another_shape"], r"policy must give whole numbers from 0 to 1"),
-        ([f"policy={__name__}:out_of_range"], r"policy must give whole numbers from 0 to 1"),
-        ([f"policy={__name__}:fails"], "policy must act in cartpole; it raised ZeroDivisionError"),
+        ("num_snapshots=5", "num_snapshots"),
+        ("search.num_top=5", "search.num_top"),
+        ("search.generationz=5", "search.generationz"),
+        ("agent=nothing", "agent"),
+        ("generations=5", "generations"),
+        ("proxy.hidden_size=5", "proxy.hidden_size"),
+        ("env=cliff_walking", "agent"),
+        ("policy=sax", "policy"),
+        ("policy=nothing:act", "policy"),
+        ("policy=td3", "agent"),
+        (f"policy={__name__}:SIGN", "policy"),
+        (f"policy={__name__}:of_another_shape", "policy"),
+        (f"policy={__name__}:out_of_range", "policy"),
+        (f"policy={__name__}:fails", "policy"),
     ],
 )
-def test_what_cannot_be_is_refused(words, message, tmp_path):
-    with pytest.raises(ConfigError, match=message):
-        main([*QUICK, f"run_dir={tmp_path}/runs/a", *words])
+def test_what_cannot_be_is_refused_and_leaves_nothing(word, field, tmp_path):
+    assert refused(main, [*QUICK, f"run_dir={tmp_path}/runs/a", word]) == field
     assert not (tmp_path / "runs").exists()
 
 
-def test_the_bonus_for_health_is_left_out_of_searches():
-    assert read(["env=hopper"])[0].search.alive_bonus == 1.0
-    assert read(["env=hopper", "search.alive_bonus=0"])[0].search.alive_bonus == 0.0
-    assert read(["env=halfcheetah"])[0].search.alive_bonus == 0.0
-    assert read(["env=halfcheetah"])[1].training.max_steps == 10_000
-
-
-def test_the_default_folder_tells_policies_apart():
-    names = []
-    for words in ([], ["policy=ppo:a/model.zip"], ["policy=dqn:model.zip"], ["policy=linear.npz"],
-                  ["policy=mine:act"]):  # fmt: skip
-        names.append(folder_of(*read(["env=cartpole", *words])).name)
-    assert names == ["distill-cartpole-s0", "distill-cartpole-ppo-model-s0",
-                     "distill-cartpole-dqn-model-s0", "distill-cartpole-linear-s0",
-                     "distill-cartpole-mine-act-s0"]  # fmt: skip
-
-
-def test_a_model_of_another_algorithm_is_one_line(tmp_path, monkeypatch):
+def test_a_model_of_another_algorithm_is_refused(tmp_path, monkeypatch):
     class DQN:
         @staticmethod
         def load(path, device):
-            raise AttributeError("'ActorCriticPolicy' object has no attribute 'q_net'")
+            raise AttributeError("it has no 'q_net'")
 
     monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace(DQN=DQN))
-    (tmp_path / "ppo.zip").write_bytes(b"")
-    words = [*QUICK, f"run_dir={tmp_path / 'run'}", f"policy=dqn:{tmp_path}/ppo.zip"]
-    with pytest.raises(
-        ConfigError, match=r"policy must be a model that DQN saved; got dqn:.*q_net"
-    ):
-        main(words)
+    for name in ("dqn", "nothing"):
+        words = [*QUICK, f"run_dir={tmp_path / 'run'}", f"policy={name}:ppo.zip"]
+        assert refused(main, words) == "policy"
     assert not (tmp_path / "run").exists()
+
+
+def test_defaults_are_those_of_the_task():
+    own, config = read(["env=hopper"])
+    assert own.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
+    assert read(["env=hopper", "search.alive_bonus=0"])[0].search.alive_bonus == 0.0
+    assert read(["env=halfcheetah"])[0].search.alive_bonus == 0.0
+    config = read(["env=cartpole", "training.max_steps=700"])[1]
+    assert config.training.max_episodes == 700 and list(config.scored_agents) == ["ddqn", "ppo"]
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([], "distill-cartpole-s0"),
+        (["policy=ppo"], "distill-cartpole-ppo-s0"),
+        (["policy=ppo:a/model.zip"], "distill-cartpole-ppo-model-s0"),
+        (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
+    ],
+)
+def test_the_default_folder_tells_policies_apart(words, name):
+    assert folder_of(*read(["env=cartpole", *words])).name == name

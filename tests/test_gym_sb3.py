@@ -114,16 +114,18 @@ def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():
     ("name", "task"), [("CartPole-v1", "cartpole"), ("Pendulum-v1", "pendulum")]
 )
 def test_a_model_of_theirs_is_a_policy_to_distil(tmp_path, name, task):
+    import jax
+
     from sejax.distill import main
     from sejax.distillation.policies import policy_of
 
     model = PPO("MlpPolicy", gymnasium.make(name), n_steps=16, batch_size=16, seed=0, device="cpu")
     model.save(tmp_path / "model.zip")
-    given = policy_of(f"ppo:{tmp_path}/model.zip", sejax.envs.make(task))
+    act = policy_of(f"ppo:{tmp_path}/model.zip", sejax.envs.make(task), 1, jax.random.key(0))
     obs = np.random.default_rng(0).normal(size=(9, *model.observation_space.shape)).astype("f4")
-    np.testing.assert_allclose(given.act(obs), model.predict(obs, deterministic=True)[0])
+    np.testing.assert_allclose(act(obs), model.predict(obs, deterministic=True)[0])
     main([
-        *(f"env={task}", f"policy=ppo:{tmp_path}/model.zip", "copy.rounds=1", "copy.episodes=2"),
+        *(f"env={task}", f"policy=ppo:{tmp_path}/model.zip", "copy.episodes=2"),
         *("copy.steps=50", "num_tested=2", "training.max_steps=600", "training.max_episodes=600"),
         *("devices=1", f"run_dir={tmp_path}/run"),
     ])  # fmt: skip

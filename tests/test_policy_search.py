@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from support import assert_equal, refused
 
 from sejax import envs
-from sejax.distillation.policy_copy import CopyConfig, acting, copy_policy, erring, visit
+from sejax.distillation.policies import CopyConfig, acting, copied, visit
 from sejax.distillation.policy_search import (
     Policy,
     SearchConfig,
@@ -19,30 +20,21 @@ from sejax.distillation.policy_search import (
     with_moments,
 )
 from sejax.distillation.teaching import grades
-from sejax.options import ConfigError
-from sejax.proxies.exact import evaluate
 
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
 SMALL = SearchConfig(num_directions=6, num_top=3, generations=10, num_tests=4)
 RNG = np.random.default_rng(1)
 
 
-@pytest.fixture(scope="module")
-def tried():
-    """A generation from a policy that is not zero, on one device and on two."""
-    found = []
+def test_a_generation_moves_along_the_best_directions_on_any_devices():
+    tried = []
+    weights = jnp.asarray(RNG.normal(size=(2, 5)), jnp.float32) * 0.1
     for devices in (1, 2):
         search = make_search(SMALL, CARTPOLE, devices)
-        before = search.init()._replace(weights=jnp.asarray(RNG_WEIGHTS))
-        found.append((before, *jax.jit(search.generation)(jax.random.key(5), before, 2)))
-    return found
-
-
-RNG_WEIGHTS = RNG.normal(size=(2, 5)).astype(np.float32) * 0.1
-
-
-def test_a_generation_moves_along_the_best_directions(tried):
-    before, after, generation = tried[0]
+        before = search.init()._replace(weights=weights)
+        tried.append(jax.jit(search.generation)(jax.random.key(5), before, 2))
+    assert_equal(*tried)
+    after, generation = tried[0]
     directions = np.asarray(
         jax.random.normal(jax.random.split(jax.random.key(5), 3)[0], (6, 2, 5)), float
     )
@@ -54,11 +46,6 @@ def test_a_generation_moves_along_the_best_directions(tried):
     np.testing.assert_allclose(after.weights, wanted, rtol=1e-4, atol=1e-6)
     # In CartPole a step pays 1: all steps of the directions, and one episode of the policy.
     assert int(generation.num_steps) == int(returns.sum()) + int(after.num_seen)
-
-
-def test_devices_do_not_matter(tried):
-    (_, one, _), (_, two, _) = tried
-    assert jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), one, two))
 
 
 def test_moments_are_those_of_all_that_was_seen():
@@ -116,60 +103,49 @@ def test_first_generations_may_be_short():
 
 @pytest.mark.parametrize("change", [{"num_top": 7}, {"noise_std": 0.0}, {"policy_error": -1.0}])
 def test_settings_that_cannot_be_are_refused(change):
-    with pytest.raises(ConfigError, match="search"):
-        dataclasses.replace(SMALL, **change)
-    with pytest.raises(ConfigError, match="vectors"):
-        make_search(SMALL, envs.make("cliff_walking"))
+    assert refused(dataclasses.replace, SMALL, **change) == f"search.{next(iter(change))}"
+
+
+def test_tasks_without_vectors_are_refused():
+    assert refused(make_search, SMALL, envs.make("cliff_walking")) == "env"
 
 
 # --- copies --------------------------------------------------------------------------------------
 
-
-def test_a_copy_does_what_the_policy_does():
-    kernel, bias = np.array([[2.0, -4.0, -1.0]]), np.array([0.3])
-
-    def policy(obs):
-        return np.clip(np.maximum(obs @ kernel.T + bias, -0.5), -2, 2)
-
-    config = CopyConfig(hidden_size=8, rounds=2, episodes=3, steps=1500)
-    found = copy_policy(config, PENDULUM, policy, jax.random.key(0))
-    assert [x.shape for x, _ in found.layers] == [(8, 3), (1, 8)]
-    error = np.clip(evaluate(found.layers, found.states), -2, 2) - policy(found.states)
-    assert np.sqrt((error**2).mean()) < 0.1
-    assert found.real_steps == 3 * 3 * 200
-    assert found.copy_return == pytest.approx(found.policy_return, abs=250)
+KEYS = dict(zip(("search", "record"), jax.random.split(jax.random.key(0)), strict=True))
+COPY = CopyConfig(hidden_size=0, episodes=4, steps=1500, agent_steps=50)
 
 
-def test_a_linear_copy_of_discrete_actions():
-    kernel = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.3, 1.0, 0.6]])
-
-    def policy(obs):
-        return (obs @ kernel.T).argmax(axis=1)
-
-    config = CopyConfig(hidden_size=0, rounds=2, episodes=4, steps=1500, policy_error=0.3)
-    found = copy_policy(config, CARTPOLE, policy, jax.random.key(0))
-    alike = acting(CARTPOLE, found.layers)(found.states) == policy(found.states)
-    assert alike.mean() > 0.8  # many states lie close to where the action changes
-    assert found.policy_return == found.copy_return == 200.0
+def swings_up(obs):
+    return np.clip(np.maximum(obs @ [[2.0], [-4.0], [-1.0]] + 0.3, -0.5), -2, 2)
 
 
-def test_errors_have_their_size_and_do_not_depend_on_who_has_ended():
-    states = RNG.normal(size=(500, 4)) * [1, 2, 0.1, 1]
-    layers = [(RNG.normal(size=(2, 4)), np.zeros(2))]
-    key, asked = jax.random.key(3), RNG.normal(size=(64, 4)) * 0.1
-    one = erring(CARTPOLE, layers, states, 0.3, key, 64)(asked)
-    asked[1:] *= 1e4  # as of episodes that go on after their end
-    assert erring(CARTPOLE, layers, states, 0.3, key, 64)(asked)[0] == one[0]
-    flat = [(np.zeros((1, 3)), np.zeros(1))]
-    seen = RNG.normal(size=(4000, 3))
-    act = erring(PENDULUM, flat, seen, 0.1, key, 4000)
-    assert 0.17 < np.sqrt((act(seen) ** 2).mean()) < 0.25  # of a bound of 2, with the bias's part
+def balances(obs):
+    return (obs @ [0.1, 0.3, 1.0, 0.6] > 0).astype(int)
+
+
+@pytest.mark.parametrize(
+    ("task", "policy", "hidden_size", "most"),
+    [(PENDULUM, swings_up, 8, 0.2), (CARTPOLE, balances, 0, 0.4)],
+)
+def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most):
+    config = dataclasses.replace(COPY, hidden_size=hidden_size)
+    (lesson,), costs = copied(config, task, f"{__name__}:{policy.__name__}", KEYS)
+    assert len(lesson.layers) == 1 + (hidden_size > 0)
+    error = acting(task, lesson.layers)(lesson.states) - policy(lesson.states)
+    print(np.sqrt((error**2).mean()))
+    assert np.sqrt((error**2).mean()) < most
+    assert len(lesson.states) < costs["real_steps"].item() <= 2 * 4 * task.max_steps
+
+
+def test_an_agent_is_trained_on_the_task_and_copied():
+    (lesson,), costs = copied(COPY, CARTPOLE, "ddqn", KEYS)
+    assert costs["real_steps"].item() > COPY.agent_steps + len(lesson.states)
 
 
 def test_visits_are_whole_episodes():
-    seen = visit(CARTPOLE, lambda obs: np.zeros(len(obs), int), jax.random.key(0), 5)
-    assert seen.returns.sum() == len(seen.states)  # a step pays 1
-    assert (seen.returns < 15).all()  # pushed to one side all the time
+    states, mean_return = visit(CARTPOLE, lambda obs: np.zeros(len(obs)), jax.random.key(0), 5)
+    assert 5 * mean_return == len(states) and mean_return < 15  # pushed to one side all the time
 
 
 # --- what SEs teach ------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from support import refused
 
 import sejax
 from sejax import envs
-from sejax.distillation.config import read
+from sejax.distill import read
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
 from sejax.runs.config import evaluate_config

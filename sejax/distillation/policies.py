@@ -1,62 +1,85 @@
-"""Policies that `python -m sejax.distill` is given: files and functions."""
+"""Policies that `python -m sejax.distill` is given, and their copies in the form of an exact SE.
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import NamedTuple
-from zipfile import BadZipFile
+A policy is a model of Stable-Baselines3, a function, or an agent of sejax. Its copy is a network of
+affine maps with ReLUs between, fitted to what the policy does in states that it visits, and in
+states where episodes of the SE begin: nowhere else does the SE show its reward.
+"""
 
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+import pandas as pd
+from jaxtyping import Array, Float
 
-from sejax.distillation.policy_copy import Actor, acting
+from sejax.agents import make_agent
+from sejax.distillation.policy_search import Lesson
 from sejax.envs.base import Task
-from sejax.options import ConfigError, registry, require, shortened, told
-from sejax.proxies.exact import Layer
+from sejax.options import ConfigError, Options, counts, option, registry, require, shortened, told
+from sejax.proxies.exact import Layer, evaluate, gaussian, require_vectors
+from sejax.training import TrainingConfig, make_trainer
 
-FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), FILE.npz or module:function."
-
-
-class Given(NamedTuple):
-    """A policy.
-
-    Attributes:
-      act: what it does.
-      layers: the same, if it is of the exact form already; None if it must be copied.
-    """
-
-    act: Actor
-    layers: Sequence[Layer] | None = None
+# Observations [state, obs_dim] to actions [state] or [state, action_dim], of NumPy.
+Actor = Callable[[np.ndarray], np.ndarray]
+FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), module:function, or an agent such as ppo."
+_BATCH_SIZE, _LEARNING_RATE = 256, 3e-3  # of the fit, by Adam
+_OVERSHOOT = 0.05  # weight of what lies beyond the bounds, where clipping has no slope
 
 
-def policy_of(text: str, task: Task) -> Given:
+@dataclass(frozen=True, kw_only=True)
+class CopyConfig(Options):
+    """How a policy is copied."""
+
+    group: ClassVar[str] = "copy"
+
+    hidden_size: int = option(32, counts("0 is a linear copy", least=0))  # ReLUs; 0: a linear copy
+    episodes: int = option(20, counts("something must be seen"))  # that the policy plays
+    steps: int = option(20_000, counts("a copy is fitted"))  # of Adam
+    # On the real task, of an agent that `policy` names.
+    agent_steps: int = option(100_000, counts("an agent must train"))
+
+
+# --- what the user names --------------------------------------------------------------------------
+
+
+def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
     """The policy that an override names.
 
     Args:
-      text: `ALGORITHM:FILE.zip`, a model of Stable-Baselines3; `FILE.npz` with `kernel_0`
-        `[out, in]`, `bias_0` and so on, affine maps with ReLUs between; or `module:function`, of
-        observations `[state, obs_dim]` to actions.
+      text: `ALGORITHM:FILE.zip`, a model of Stable-Baselines3; `module:function`, of observations
+        `[state, obs_dim]` to actions; or the name of an agent, which is trained.
       task: the real task.
+      agent_steps: steps on the real task for which an agent trains.
+      key: of that training.
 
     Raises:
-      ConfigError: for anything else.
+      ConfigError: for anything else; where the policy is called, if it fails, or its actions are
+        none of the task.
     """
     if text.endswith(".zip"):
-        return Given(checked(_of_sb3(text, task), task))
-    if text.endswith(".npz"):
-        layers = _of_file(text)
-        return Given(checked(acting(task, layers), task), layers)
-    require(":" in text, "policy", f"must be a file or a function; got {shortened(text)}. {FIX}")
-    return Given(checked(_of_function(text), task))
+        return _checked(_of_sb3(text, task), task)
+    if is_agent(text):
+        return _of_agent(text, task, agent_steps, key)
+    require(":" in text, "policy", f"must be a model or a function; got {shortened(text)}. {FIX}")
+    registry.require_path("policy", text)
+    return _checked(registry.imported("policy", text), task)
 
 
-def checked(act: Actor, task: Task) -> Actor:
-    """The policy, whose actions are looked at.
+def is_agent(text: str) -> bool:
+    """Whether an override names an agent of sejax, or of an installed package."""
+    return registry.is_registered("agent", text)
 
-    Raises:
-      ConfigError: where it is called, if it fails, or its actions are none of the task.
-    """
+
+def _checked(act: Actor, task: Task) -> Actor:
+    """The policy, whose actions are looked at."""
     count = task.num_actions
 
-    def wrapped(obs: np.ndarray) -> np.ndarray:
+    def checked(obs: np.ndarray) -> np.ndarray:
         shape = (len(obs),) if count is not None else (len(obs), task.action_dim)
         try:
             actions = np.asarray(act(obs), float)
@@ -64,80 +87,169 @@ def checked(act: Actor, task: Task) -> Actor:
             raise ConfigError(
                 f"policy must act in {task.name}; it raised {told(error)}.", "policy"
             ) from error
-        holds = actions.shape == shape and np.isfinite(actions).all()
-        if holds and count is not None:
-            holds = bool(((actions >= 0) & (actions < count) & (actions % 1 == 0)).all())
         kind = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
+        known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
         require(
-            holds,
+            actions.shape == shape and known.all(),
             "policy",
             f"must give {kind} of the shape {list(shape)}; got {list(actions.shape)}, such as "
             f"{shortened(actions.ravel()[:3], 40)}. Set another policy.",
         )
-        return actions.astype(np.int32) if count is not None else actions
+        return actions
 
-    return wrapped
+    return checked
 
 
 def _of_sb3(text: str, task: Task) -> Actor:
     name, _, path = text.partition(":")
-    must = f"must name an algorithm and a file; got {shortened(text)}. Set policy=ppo:FILE.zip."
-    require(Path(path).is_file(), "policy", must)
     try:
         import stable_baselines3
-    except ImportError as error:
-        raise ConfigError(
-            f"policy must be no model of Stable-Baselines3 without it; got {text}. Install it with "
-            "pip install 'sejax[sb3]'.",
-            "policy",
-        ) from error
-    cls = getattr(stable_baselines3, name.upper(), None)
-    require(cls is not None, "policy", must)
-    try:
-        model = cls.load(path, device="cpu")  # type: ignore[union-attr]
+
+        model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # whatever lacks where another algorithm looks for it
         raise ConfigError(
-            f"policy must be a model that {name.upper()} saved; got {text} ({told(error)}). Set "
-            "policy=ALGORITHM:FILE.zip, with the algorithm of the file.",
+            f"policy must be a model that its algorithm saved; got {shortened(text)} "
+            f"({told(error)}). Set policy=ppo:FILE.zip; it needs pip install 'sejax[sb3]'.",
             "policy",
         ) from error
-    size, wanted = model.observation_space.shape, (task.obs_dim,)
-    require(
-        size == wanted,
-        "policy",
-        f"must act on observations of the shape {wanted}; got {size}. Set another file.",
-    )
-    bound = getattr(model.action_space, "high", np.ones(1))
+    if task.num_actions is not None:
+        return lambda obs: model.predict(obs, deterministic=True)[0]
     # A task whose bounds are not alike everywhere is scaled to [-1, 1].
-    factor = 1.0 if task.num_actions is not None else task.max_action / np.asarray(bound, float)
+    factor = task.max_action / np.asarray(model.action_space.high, float)
     return lambda obs: model.predict(obs, deterministic=True)[0] * factor
 
 
-def _of_file(text: str) -> list[Layer]:
-    try:
-        stored = np.load(text, allow_pickle=False)
-        count = sum(name.startswith("kernel_") for name in stored.files)
-        layers = [(stored[f"kernel_{i}"], stored[f"bias_{i}"]) for i in range(count)]
-        require(
-            count > 0, "policy", f"must hold kernel_0, bias_0 and so on; got {stored.files}. {FIX}"
-        )
-    except ConfigError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
-        raise ConfigError(
-            f"policy must be a file of kernel_0, bias_0 and so on; got {shortened(text)} "
-            f"({told(error)}). {FIX}",
-            "policy",
-        ) from error
-    return [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
-
-
-def _of_function(text: str) -> Actor:
-    registry.require_path("policy", text)
-    found = registry.imported("policy", text)
-    require(
-        callable(found),
-        "policy",
-        f"must be a function of observations; got {type(found).__name__}. {FIX}",
+def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
+    """A fresh agent with its default hyperparameters, trained on the real task."""
+    agent = make_agent(registry.configure("agent", {"name": name}), task)
+    training = TrainingConfig(
+        max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
     )
-    return lambda obs: np.asarray(found(obs))
+    key_train, key_act = jax.random.split(key)
+    print(f"training a {name} on {task.name} for {num_steps:,} steps ...", flush=True)
+    state = jax.jit(make_trainer(agent, task.env, training))(key_train, task.params).agent_state
+
+    def act(obs: Array) -> Array:
+        return agent.env_action(agent.act(key_act, state, obs, explore=False))
+
+    return jax.jit(jax.vmap(act))
+
+
+# --- copies ---------------------------------------------------------------------------------------
+
+
+def copied(
+    config: CopyConfig,
+    task: Task,
+    policy: str,
+    keys: Mapping[str, Array],
+    independent_starts: bool = False,
+) -> tuple[list[Lesson], pd.DataFrame]:
+    """The copy of a policy as the only lesson, and a row of what it cost: `real_steps` and `cpu_s`.
+
+    Args:
+      config: form and effort.
+      task: the real task.
+      policy: as of `policy_of`.
+      keys: `search`, for training an agent; `record`, for all else.
+      independent_starts: as of `sejax.proxies.exact.make_exact`.
+    """
+    require_vectors(task)
+    started = time.process_time()
+    act = policy_of(policy, task, config.agent_steps, keys["search"])
+    key_visit, key_starts, key_fit, key_test = jax.random.split(keys["record"], 4)
+    visited, policy_return = visit(task, act, key_visit, config.episodes)
+    noise = np.asarray(jax.random.normal(key_starts, visited.shape))
+    starts = noise + evaluate(gaussian(visited, independent_starts), noise)
+    states = np.concatenate([visited, starts.astype(np.float32)])
+    layers = fit(config, task, states, np.asarray(act(states)), key_fit)
+    tested, copy_return = visit(task, acting(task, layers), key_test, config.episodes)
+    print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
+    real_steps = len(visited) + len(tested) + (config.agent_steps if is_agent(policy) else 0)
+    costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
+    return [Lesson(0, layers, visited, policy_return)], pd.DataFrame(costs)
+
+
+def acting(task: Task, layers: Sequence[Layer]) -> Actor:
+    """What a policy of affine maps and ReLUs does: the best action, or its outputs clipped."""
+    if task.num_actions is not None:
+        return lambda obs: evaluate(layers, obs).argmax(axis=1)
+    return lambda obs: evaluate(layers, obs).clip(-task.max_action, task.max_action)
+
+
+def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray, float]:
+    """All observations `[state, obs_dim]` of whole episodes side by side, and the mean return.
+
+    The actor may be of any library.
+    """
+    env, params = task.env, task.params
+    reset = jax.jit(jax.vmap(lambda key: env.reset_env(key, params)))
+    step = jax.jit(jax.vmap(lambda key, state, x: env.step_env(key, state, x, params)[:4]))
+    dtype = np.int32 if task.num_actions is not None else np.float32
+    key_reset, key_steps = jax.random.split(key)
+    obs, state = reset(jax.random.split(key_reset, episodes))
+    active, total, seen = np.ones(episodes, bool), 0.0, []
+    for i in range(task.max_steps):
+        seen.append(np.asarray(obs)[active])
+        action = np.asarray(act(np.asarray(obs))).astype(dtype)
+        keys = jax.random.split(jax.random.fold_in(key_steps, i), episodes)
+        obs, state, reward, terminated = step(keys, state, action)
+        total += float(np.asarray(reward)[active].sum())
+        active &= ~np.asarray(terminated)
+        if not active.any():
+            break
+    return np.concatenate(seen), total / episodes
+
+
+def fit(
+    config: CopyConfig, task: Task, states: np.ndarray, actions: np.ndarray, key: Array
+) -> list[Layer]:
+    """A copy of what a policy does in some states.
+
+    Continuous actions by squared error after clipping, discrete ones by cross-entropy.
+    """
+    is_discrete = task.num_actions is not None
+    mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
+    inputs = jnp.asarray((states - mean) / std, jnp.float32)
+    targets = jnp.asarray(actions / task.max_action, jnp.int32 if is_discrete else jnp.float32)
+    key_init, key_fit = jax.random.split(key)
+    sizes = [task.obs_dim, *[config.hidden_size] * (config.hidden_size > 0), task.action_dim]
+    keys = jax.random.split(key_init, len(sizes) - 1)
+    params = [
+        (jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out))
+        for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
+    ]
+    optimiser = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.steps))
+
+    def outputs(params: Any, x: Float[Array, "batch inputs"]) -> Array:
+        *hidden, (kernel, bias) = params
+        for inner, shift in hidden:
+            x = jax.nn.relu(x @ inner.T + shift)
+        return x @ kernel.T + bias
+
+    def loss(params: Any, key: Array) -> Array:
+        rows = jax.random.randint(key, (_BATCH_SIZE,), 0, len(inputs))
+        given, wanted = outputs(params, inputs[rows]), targets[rows]
+        if is_discrete:
+            return optax.softmax_cross_entropy_with_integer_labels(given, wanted).mean()
+        clipped = jnp.clip(given, -1.0, 1.0)
+        # Beyond a bound that is wrong, clipping has no slope: tanh pulls back.
+        pull = 0.1 * (jnp.tanh(given) - wanted) ** 2
+        return jnp.mean((clipped - wanted) ** 2 + _OVERSHOOT * (given - clipped) ** 2 + pull)
+
+    @jax.jit
+    def run(params: Any, key: Array) -> Any:
+        def step(carry: Any, key: Array) -> tuple[Any, None]:
+            params, state = carry
+            updates, state = optimiser.update(jax.grad(loss)(params, key), state)
+            return (optax.apply_updates(params, updates), state), None
+
+        keys = jax.random.split(key, config.steps)
+        return jax.lax.scan(step, (params, optimiser.init(params)), keys)[0][0]
+
+    fitted = [(np.asarray(k, float), np.asarray(b, float)) for k, b in run(params, key_fit)]
+    kernel, bias = fitted[0]
+    fitted[0] = (kernel / std, bias - (kernel / std) @ mean)
+    kernel, bias = fitted[-1]
+    fitted[-1] = (task.max_action * kernel, task.max_action * bias)
+    return fitted

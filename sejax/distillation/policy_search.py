@@ -6,17 +6,23 @@ moves along those that made the largest difference. It is one compiled program.
 A policy that is to be taught to agents must bear that they learn it roughly. So each episode may be
 played with an error of its own, a random linear map of the observation that is added to the policy.
 
+A whole search starts several times; the start whose policy was tested best goes on. What was done
+up to each test is kept, so that a search which was stopped goes on.
+
 Source: Mania et al., "Simple random search of static linear policies is competitive for
 reinforcement learning" (2018), Algorithm 2 (V2-t). The emulated error is ours.
 """
 
-from collections.abc import Callable
+import functools
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.fixed import make_fixed
@@ -24,7 +30,13 @@ from sejax.envs.base import Task
 from sejax.evaluation import make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import Options, counts, finite, not_negative, option, positive, require
-from sejax.proxies.exact import Layer
+from sejax.proxies.exact import Layer, require_vectors
+from sejax.runs.store import Store
+
+Arrays = dict[str, np.ndarray]
+
+# Columns of search.csv: a row for each policy that was tested.
+COLUMNS = ("start", "generation", "test_mean", "test_std", "real_steps", "cpu_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,47 +47,26 @@ class SearchConfig(Options):
     group: ClassVar[str] = "search"
 
     generations: int = option(100, counts("something must be searched"))
-    num_starts: int = option(
-        3,
-        counts("a search begins"),
-        help=(
-            "Searches that begin, each for so many generations (up to a test); the one whose "
-            "policy was tested best goes on. A search may stop at a poor gait, which shows early."
-        ),
-    )
+    # Searches that begin, each for so many generations (up to a test); the one whose policy was
+    # tested best goes on. A search may stop at a poor gait, which shows early.
+    num_starts: int = option(3, counts("a search begins"))
     start_generations: int = option(40, counts("a start must be tried"))
-    num_directions: int = option(32, counts("something must be tried"), help="N, two episodes each")
-    num_top: int = option(
-        16, counts("something must be learned from"), help="b: directions that count"
-    )
-    noise_std: float = option(0.03, positive("directions must differ"), help="nu")
-    step_size: float = option(0.02, positive("the policy would not move"), help="alpha")
-    constant: float = option(
-        0.5,
-        not_negative("it is a share of the generations"),
-        help="Share of the generations after which the step size declines, to a tenth at the end.",
-    )
-    policy_error: float = option(
-        0.1,
-        not_negative("it is a size"),
-        help=(
-            "Root mean square of the error of an episode's policy, in units of the action's "
-            "bound; of discrete actions in units of the policy's own outputs."
-        ),
-    )
-    alive_bonus: float | None = option(
-        None,
-        finite("it is a reward"),
-        help=(
-            "Subtracted from each step's reward while searching; null: the task's reward for "
-            "being healthy."
-        ),
-    )
-    short_steps: int | None = option(
-        None, counts("an episode has steps"), help="The first generations have shorter episodes."
-    )
+    num_directions: int = option(32, counts("something must be tried"))  # N, two episodes each
+    num_top: int = option(16, counts("something must be learned from"))  # b: directions that count
+    noise_std: float = option(0.03, positive("directions must differ"))  # nu
+    step_size: float = option(0.02, positive("the policy would not move"))  # alpha
+    # Share of the generations after which the step size declines, to a tenth at the end.
+    constant: float = option(0.5, not_negative("it is a share of the generations"))
+    # Root mean square of the error of an episode's policy, in units of the action's bound; of
+    # discrete actions in units of the policy's own outputs.
+    policy_error: float = option(0.1, not_negative("it is a size"))
+    # Subtracted from each step's reward while searching; unless given, the task's reward for being
+    # healthy.
+    alive_bonus: float = option(0.0, finite("it is a reward"))
+    # The first generations have shorter episodes.
+    short_steps: int | None = option(None, counts("an episode has steps"))
     short_generations: int = option(0, counts("it counts generations", least=0))
-    num_tests: int = option(5, counts("a policy must be tested"), help="episodes without the error")
+    num_tests: int = option(5, counts("a policy must be tested"))  # episodes without the error
     test_every: int = option(10, counts("it counts generations"))
 
     def __post_init__(self) -> None:
@@ -158,7 +149,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     """Builds the functions of a search.
 
     Args:
-      config: of the search; `alive_bonus` None is 0 here.
+      config: of the search.
       task: the real task.
       devices: that episodes are spread over; None for all.
 
@@ -173,16 +164,11 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
       >>> policy.weights.shape, tried.returns.shape
       ((3, 3), (8,))
     """
-    require(
-        task.num_states is None,
-        "env",
-        f"must have vectors as observations; got {task.name}. Set env=cartpole.",
-    )
+    require_vectors(task)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
     shape = task.action_dim, task.obs_dim + 1
     play = make_tester(agent, task, 1)
     record_one = make_recorder(agent, task, 1)
-    bonus = config.alive_bonus or 0.0
 
     def init() -> Policy:
         zeros = jnp.zeros(task.obs_dim)
@@ -220,7 +206,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         returns, num_steps = spread(
             keys, tried._replace(weights=weights), error_size(policy), limits
         )
-        plus, minus = jnp.split(_finite(returns - bonus * num_steps), 2)
+        plus, minus = jnp.split(_finite(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
         slope = jnp.tensordot((plus - minus)[top], directions[top], 1)
@@ -277,3 +263,128 @@ def with_moments(policy: Policy, obs: Float[Array, "step obs_dim"], valid: Array
         mean=policy.mean + apart * share,
         square=policy.square + square + apart**2 * policy.num_seen * share,
     )
+
+
+# --- a whole search, kept on disk ----------------------------------------------------------------
+
+
+class Lesson(NamedTuple):
+    """A policy that is to be taught.
+
+    Attributes:
+      generation: of the search that it is of; 0 for a copy.
+      layers: as of `sejax.proxies.exact`.
+      states: observations that it visited, `[state, obs_dim]`.
+      policy_return: its mean return on the real task.
+    """
+
+    generation: int
+    layers: Sequence[Layer]
+    states: np.ndarray
+    policy_return: float
+
+
+def searched(
+    options: SearchConfig,
+    task: Task,
+    num_lessons: int,
+    keys: dict[str, Array],
+    store: Store,
+    devices: int | None = None,
+) -> tuple[list[Lesson], pd.DataFrame]:
+    """The best tested policy of each of so many equal parts of a search.
+
+    Args:
+      options: of the search.
+      task: the real task.
+      num_lessons: parts of the search.
+      keys: `search`, `test` and `record`.
+      store: where each step of the search is kept.
+      devices: number of devices that episodes are spread over; None for all.
+
+    Returns:
+      The lessons, and a row of `COLUMNS` for each policy that was tested.
+    """
+    search = _Search(options, task, keys, store, devices)
+    firsts = range(0, options.generations, options.test_every)
+    num_tried = -(-min(options.start_generations, options.generations) // options.test_every)
+    ends = [search.advance(i, firsts[:num_tried], search.init()) for i in range(options.num_starts)]
+    best = int(max(search.tested, key=_test_mean)["start"])
+    search.advance(best, firsts[num_tried:], ends[best])
+    went_on = [tested for tested in search.tested if tested["start"] == best]
+    parts = np.array_split(np.arange(len(went_on)), num_lessons)
+    lessons = [search.lesson(max((went_on[i] for i in part), key=_test_mean)) for part in parts]
+    rows = [{name: tested[name].item() for name in COLUMNS} for tested in search.tested]
+    return lessons, pd.DataFrame(rows)
+
+
+class _Search:
+    """A search whose steps are kept; `tested` has a policy and its row for each, in their order."""
+
+    def __init__(
+        self,
+        options: SearchConfig,
+        task: Task,
+        keys: dict[str, Array],
+        store: Store,
+        devices: int | None,
+    ):
+        self._options, self._task, self._keys, self._store = options, task, keys, store
+        search = make_search(options, task, devices)
+        self.init, self._generation = search.init, jax.jit(search.generation)
+        self._test, self._record = jax.jit(search.test), jax.jit(search.record)
+        self.tested: list[Arrays] = []
+
+    def advance(self, start: int, firsts: Sequence[int], policy: Policy) -> Policy:
+        """The policy of a start after the blocks of generations that begin with these."""
+        for first in firsts:
+            climb = functools.partial(self._climb, start, first, policy)
+            self.tested.append(self._store.once(f"search/start{start}-{first}", climb))
+            policy = _policy_of(self.tested[-1])
+        return policy
+
+    def lesson(self, tested: Arrays) -> Lesson:
+        """A tested policy, with what it visits in other episodes: tests had a part in choosing."""
+        started, generation = time.process_time(), int(tested["generation"])
+        policy = _policy_of(tested)
+        seen = self._record(jax.random.fold_in(self._keys["record"], generation), policy)
+        valid = np.asarray(seen.valid)
+        states, total = np.asarray(seen.obs)[valid], float(np.asarray(seen.reward)[valid].sum())
+        layers = policy.layers(self._task.max_action)
+        tested["real_steps"] = tested["real_steps"] + len(states)
+        tested["cpu_s"] = tested["cpu_s"] + time.process_time() - started
+        return Lesson(generation, layers, states, total / self._options.num_tests)
+
+    def _climb(self, start: int, first: int, policy: Policy) -> Arrays:
+        """The policy after the generations up to its next test, and its row."""
+        started, num_steps = time.process_time(), 0
+        last = min(first + self._options.test_every, self._options.generations)
+        key = jax.random.fold_in(self._keys["search"], start)
+        for number in range(first, last):
+            policy, tried = self._generation(jax.random.fold_in(key, number), policy, number)
+            num_steps += int(tried.num_steps)
+        key_test = jax.random.fold_in(jax.random.fold_in(self._keys["test"], start), last)
+        tests = self._test(key_test, policy)
+        row = {
+            "start": start,
+            "generation": last,
+            "test_mean": float(tests.returns.mean()),
+            "test_std": float(tests.returns.std()),
+            "real_steps": num_steps + int(tests.num_steps.sum()),
+            "cpu_s": time.process_time() - started,
+        }
+        print(
+            f"start {start}, generation {last}: policy {row['test_mean']:.1f} ± "
+            f"{row['test_std']:.1f}",
+            flush=True,
+        )
+        return {name: np.asarray(value) for name, value in (policy._asdict() | row).items()}
+
+
+def _policy_of(tested: Arrays) -> Policy:
+    return Policy(*(jnp.asarray(tested[name]) for name in Policy._fields))
+
+
+def _test_mean(tested: Arrays) -> float:
+    """The mean return of its tests; the lowest number if it is none."""
+    return float(np.nan_to_num(tested["test_mean"], nan=-np.inf))

@@ -5,8 +5,9 @@ falls. So an SE is chosen by agents that train on it and are tested on the real 
 say what it teaches.
 """
 
+import functools
+import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,42 +15,64 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, PyTree
 
+from sejax.agents import make_agent
 from sejax.agents.base import Agent
-from sejax.envs.base import Task
+from sejax.distillation.policy_search import Lesson
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.exact import Layer, make_exact
+from sejax.proxies.io import fingerprint
+from sejax.runs.config import LearnConfig
+from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
+COLUMNS = ("test_return", "train_steps", "real_steps", "cpu_s")  # of a student
 
-class Lesson(NamedTuple):
-    """A policy that is to be taught.
 
-    Attributes:
-      generation: of the search that it is of; 0 for a copy.
-      layers: as of `sejax.proxies.exact`.
-      states: observations that it visited, `[state, obs_dim]`.
-      policy_return: its mean return on the real task.
+def students(
+    env: ProxyEnv,
+    weights: Sequence[PyTree],
+    lessons: Sequence[Lesson],
+    config: LearnConfig,
+    keys: Array,
+    store: Store,
+) -> pd.DataFrame:
+    """A row for each student on each SE.
+
+    The students of an agent are kept in the store before those of the next one train.
+
+    Args:
+      env: of the SEs.
+      weights: of each SE.
+      lessons: that the SEs were made of.
+      config: agents and their trainings.
+      keys: of the students, `[student]`, the same on all SEs.
+      store: where students are kept.
     """
-
-    generation: int
-    layers: Sequence[Layer]
-    states: np.ndarray
-    policy_return: float
-
-
-def make_ses(
-    task: Task, lessons: Sequence[Lesson], **options: Any
-) -> tuple[ProxyEnv, list[dict[str, Any]]]:
-    """An SE of each lesson: the environment that they share, and the weights of each.
-
-    `options` are those of `sejax.proxies.exact.make_exact`.
-    """
-    made = [make_exact(task, each.layers, each.states, **options) for each in lessons]
-    return made[0][0], [weights for _, weights in made]
+    tables = []
+    # By the weights, as what `policy` names may have changed.
+    taught_by = fingerprint({str(i): each for i, each in enumerate(weights)})
+    lesson, student = (x.ravel().tolist() for x in np.indices((len(lessons), len(keys))))
+    for key, agent_config in config.agents.items():
+        agent = make_agent(agent_config, env.task, config.exploration)
+        train = functools.partial(teach, env, weights, agent, config.training, keys, config.devices)
+        taught = store.once(f"students/{key}-{taught_by}", train)
+        table = pd.DataFrame(
+            {
+                "generation": [lessons[i].generation for i in lesson],
+                "policy_return": [lessons[i].policy_return for i in lesson],
+                "agent": key,
+                "student": student,
+                **{column: taught[column] for column in COLUMNS},
+            }
+        )
+        returns = counted(table["test_return"])
+        mean, worst = returns.mean(), returns.min()
+        print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}")
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
 
 
 def teach(
@@ -59,57 +82,43 @@ def teach(
     training: TrainingConfig,
     keys: Array,
     devices: int | None = None,
-) -> Outcome:
-    """Trains fresh agents on each SE and tests them on the real task; leaves `[se, agent]`.
+) -> dict[str, np.ndarray]:
+    """Trains fresh agents on each SE and tests them on the real task.
 
     Args:
       env: of the SEs.
-      weights: of each.
-      agent: the kind of students.
+      weights: of each SE.
+      agent: of the students.
       training: of a student; `test_episodes` are those on the real task.
-      keys: of the students, `[agent]`, the same on all SEs.
-      devices: that they are spread over; None for all.
+      keys: of the students, `[student]`, the same on all SEs.
+      devices: number of devices that they are spread over; None for all.
+
+    Returns:
+      By name, `[se * student]` each: `test_return`, the mean over test episodes, nan for a student
+      that diverged; `train_steps`; `real_steps`; `cpu_s`, the mean CPU seconds of a student.
     """
+    started = time.process_time()
     evaluate = make_evaluator(agent, env, env.task, training)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *weights)
-    shape = len(weights), len(keys)
-    se, student = (x.reshape(-1) for x in np.indices(shape))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
+    se, student = (indices.ravel() for indices in np.indices((len(weights), len(keys))))
     spread = spread_over_devices(
         lambda key, one: evaluate(key, env.params(one)),
         devices,
         cpu_num_parallel=num_parallel_on_cpu(agent, training),
     )
 
-    def all_of(keys: Array, stacked: PyTree) -> Outcome:
-        outcome = spread(keys[student], jax.tree.map(lambda x: x[se], stacked))
-        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), outcome)
+    def train_all(keys: Array, stacked: PyTree) -> Outcome:
+        return spread(keys[student], jax.tree.map(lambda leaf: leaf[se], stacked))
 
-    taught: Outcome = jax.device_get(
-        jax.jit(all_of, compiler_options=compiler_options())(keys, stacked)
-    )
-    return taught
-
-
-def as_rows(taught: Outcome, lessons: Sequence[Lesson], kind: str, use: str) -> pd.DataFrame:
-    """A row for each student: its SE's generation, its kind and number, its mean test return.
-
-    The return of one that diverged is nan.
-    """
-    means = np.asarray(taught.test_returns, float).mean(axis=-1)
-    means = np.where(taught.nonfinite, np.nan, means)
-    lesson, student = (x.ravel().tolist() for x in np.indices(means.shape))
-    return pd.DataFrame(
-        {
-            "use": use,
-            "generation": [lessons[i].generation for i in lesson],
-            "policy_return": [lessons[i].policy_return for i in lesson],
-            "agent": kind,
-            "student": student,
-            "test_return": means.ravel(),
-            "train_steps": np.asarray(taught.train_steps).ravel(),
-            "real_steps": np.asarray(taught.real_steps).ravel(),
-        }
-    )
+    program = jax.jit(train_all, compiler_options=compiler_options())
+    outcome: Outcome = jax.device_get(program(keys, stacked))
+    means = np.asarray(outcome.test_returns, float).mean(axis=-1)
+    return {
+        "test_return": np.where(outcome.nonfinite, np.nan, means),
+        "train_steps": np.asarray(outcome.train_steps),
+        "real_steps": np.asarray(outcome.real_steps),
+        "cpu_s": np.full(len(se), (time.process_time() - started) / len(se)),
+    }
 
 
 def counted(returns: pd.Series) -> pd.Series:
@@ -124,10 +133,10 @@ def counted(returns: pd.Series) -> pd.Series:
 
 
 def grades(rows: pd.DataFrame) -> pd.Series:
-    """How well each SE teaches, by generation: the mean over kinds of (mean + worst student) / 2.
+    """How well each SE teaches, by generation: the mean over agents of (mean + worst student) / 2.
 
     A student that diverged is as bad as the worst of all.
     """
     returns = counted(rows["test_return"])
-    by_kind = returns.groupby([rows["generation"], rows["agent"]]).agg(["mean", "min"])
-    return by_kind.mean(axis=1).groupby("generation").mean()
+    by_agent = returns.groupby([rows["generation"], rows["agent"]]).agg(["mean", "min"])
+    return by_agent.mean(axis=1).groupby("generation").mean()

@@ -1,12 +1,12 @@
 r"""One-step SEs whose best policy is known: written down, with nothing fitted.
 
 The reward of a one-step SE says which action is best in a state, so that it can be built from a
-policy. Where actions are continuous, the reward is minus the distance to the policy's action, or
-its square (`proxy.reward_form`); where they are discrete, each action that the policy likes better
-costs, in a network of ReLUs that is no approximation:
+policy. Where actions are continuous, the reward is minus the distance to the policy's action. Where
+they are discrete, each action that the policy likes better costs, in a network of ReLUs that is no
+approximation:
 
-.. math:: r(s, a) = -c \sum_i |a_i - \mathrm{clip}(u_i(s))| \qquad
-   r(s, a) = -c \sum_j \mathrm{clip}((u_j(s) - u_a(s)) / m, 0, 1)
+.. math:: r(s, a) = -\sum_i |a_i - \mathrm{clip}(u_i(s))| \qquad
+   r(s, a) = -\sum_j \mathrm{clip}((u_j(s) - u_a(s)) / m, 0, 1)
 
 Episodes begin in a Gaussian with the mean and covariance of states that the policy visited.
 
@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sejax.envs.base import Task
-from sejax.options import positive, require
+from sejax.options import require
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig
 
@@ -36,10 +37,6 @@ def make_exact(
     task: Task,
     layers: Sequence[Layer],
     states: np.ndarray,
-    *,
-    form: str = "distance",
-    slope: float = 1.0,
-    widen: float = 1.0,
     independent_starts: bool = False,
 ) -> tuple[ProxyEnv, dict[str, Any]]:
     """A one-step SE whose best policy is a given one.
@@ -50,11 +47,8 @@ def make_exact(
         are its output `[action_dim]`, clipped to the task's bounds; of discrete ones the one with
         the largest output `[num_actions]` is best.
       states: observations that the policy visited, `[state, obs_dim]`, in the task's units.
-      form: of the reward where actions are continuous, `distance` or `quadratic`.
-      slope: c, what a unit of it costs, or an action that is not the best.
-      widen: deviation of the initial states, in units of the visited ones'.
-      independent_starts: whether their numbers are independent; else they have the covariance of
-        the visited states.
+      independent_starts: whether the numbers of an initial state are independent; else they have
+        the covariance of the visited states.
 
     Returns:
       The SE, and its weights; `sejax.save` writes them.
@@ -72,59 +66,57 @@ def make_exact(
       >>> abs(float(reward)) < 1e-6
       True
     """
-    task_states = np.asarray(states, float)
+    states = np.asarray(states, float)
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
-    _require_fit(task, layers, task_states)
-    positive("a reward must tell actions apart")("slope", slope, 1.0)
-    positive("it is a scale")("widen", widen, 1.0)
-    known: dict[str, Any] = {}
-    if task.num_actions is None:
-        reward = _as_network(layers, task.max_action)
-        known = {"reward_form": form, "reward_slope": slope}
-    else:
-        reward = _preference(layers, task_states, slope)
+    _require_fit(task, layers, states)
+    is_discrete = task.num_actions is not None
+    reward = _preference(layers, states) if is_discrete else _as_network(layers, task.max_action)
     config = SyntheticConfig(
         hidden_size=max(len(bias) for _, bias in reward[:-1]),
         num_layers=len(reward) - 1,
         start_hidden_size=max(START_HIDDEN_SIZE, task.obs_dim),
         activation="relu",
-        **known,
+        reward_form="network" if is_discrete else "distance",
     )
+    starts = gaussian(states, independent_starts)
     weights = {
-        "reward": as_weights(reward, config.hidden_size),
-        "start": as_weights(
-            gaussian(task_states, widen, independent_starts), config.start_hidden_size
-        ),
+        "reward": _as_weights(reward, config.hidden_size),
+        "start": _as_weights(starts, config.start_hidden_size),
     }
     return config.make(task), weights
 
 
 def _require_fit(task: Task, layers: Sequence[Layer], states: np.ndarray) -> None:
+    require_vectors(task)
     require(
-        task.num_states is None,
-        "env",
-        f"must have vectors as observations; got {task.name}. Set env=cartpole.",
-    )
-    require(
-        states.ndim == 2 and states.shape[1] == task.obs_dim and len(states) > 1,
+        states.shape[1:] == (task.obs_dim,) and len(states) > 1 and np.isfinite(states).all(),
         "states",
-        f"must be several of {task.obs_dim} numbers each; got the shape {list(states.shape)}. Set "
-        "observations that the policy visited.",
+        f"must be several of {task.obs_dim} finite numbers each; got others, of the shape "
+        f"{list(states.shape)}. Set observations that the policy visited.",
     )
     sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
-    shapes = [tuple(kernel.shape) for kernel, _ in layers]
-    fitting = list(zip(sizes[1:], sizes[:-1], strict=True))
+    shapes = [kernel.shape for kernel, _ in layers]
+    fitting = [*zip(sizes[1:], sizes[:-1], strict=True)]
     require(
         shapes == fitting and sizes[-1] == task.action_dim and len(layers) > 0,
         "policy",
         f"must map {task.obs_dim} numbers to {task.action_dim}, each layer what the one before it "
         f"gives; got kernels of the shapes {shapes}. Set layers=[(kernel, bias)].",
     )
-    numbers = [states, *(x for layer in layers for x in layer)]
+    is_finite = all(np.isfinite(numbers).all() for layer in layers for numbers in layer)
+    require(is_finite, "policy", "must have finite numbers; got others. Set another policy.")
+
+
+def require_vectors(task: Task) -> None:
+    """Checks that a task's observations are vectors.
+
+    Raises:
+      ConfigError: if they are not.
+    """
     require(
-        all(np.isfinite(x).all() for x in numbers),
-        "policy",
-        "must have finite numbers, in its states too; got others. Set another policy.",
+        task.num_states is None,
+        "env",
+        f"must have vectors as observations; got {task.name}. Set env=cartpole.",
     )
 
 
@@ -138,18 +130,22 @@ def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:
     return [*hidden, (kernel / bound, bias / bound)]
 
 
-def _preference(layers: Sequence[Layer], states: np.ndarray, slope: float) -> list[Layer]:
+def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
     """Minus what an action, one-hot, costs for each that the policy likes better.
 
     An action that is better by the margin m, or more, costs 1; a tenth of such differences in
     the given states are smaller than m, so that nearly every wrong action costs as much.
     """
-    size = len(layers[-1][1])
     outputs = evaluate(layers, states)
-    better, chosen = (np.array(x) for x in zip(*_pairs(size), strict=True))
+    size = outputs.shape[1]
+    better, chosen = np.nonzero(~np.eye(size, dtype=bool))  # [pair] each
     differences = np.abs(outputs[:, better] - outputs[:, chosen])
     margin = max(float(np.quantile(differences, 0.1)), 1e-6 * float(np.abs(outputs).max()), 1e-9)
-    *hidden, (kernel, bias) = _with_action(layers, size)
+    # The network's input is the one-hot action before the observation; each layer hands it on.
+    *hidden, (kernel, bias) = (
+        (block_diag(np.eye(size), kernel), np.concatenate([np.zeros(size), bias]))
+        for kernel, bias in layers
+    )
     action, output, own = kernel[:size], kernel[size:] / margin, bias[size:] / margin
     apart, shift = output[better] - output[chosen], own[better] - own[chosen]
     # relu(x) - relu(x - 1) is clip(x, 0, 1).
@@ -160,34 +156,17 @@ def _preference(layers: Sequence[Layer], states: np.ndarray, slope: float) -> li
     # relu(clip - 1 + a) is clip for the action that was chosen, and 0 for others.
     pairs = np.eye(len(better))
     costs = np.concatenate([np.eye(size)[chosen], pairs, -pairs], axis=1), -np.ones(len(better))
-    return [*hidden, clipped, costs, (np.full((1, len(better)), -slope), np.zeros(1))]
+    return [*hidden, clipped, costs, (np.full((1, len(better)), -1.0), np.zeros(1))]
 
 
-def _pairs(size: int) -> list[tuple[int, int]]:
-    return [(j, k) for j in range(size) for k in range(size) if j != k]
-
-
-def _with_action(layers: Sequence[Layer], size: int) -> list[Layer]:
-    """The policy's layers, which hand on the action `[size]`, one-hot, beside.
-
-    The network's input is the action before the observation, and so are the outputs of each layer.
-    """
-    found = []
-    for kernel, bias in layers:
-        beside = np.zeros((size, kernel.shape[1])), np.zeros((len(bias), size))
-        wide = np.block([[np.eye(size), beside[0]], [beside[1], kernel]])
-        found.append((wide, np.concatenate([np.zeros(size), bias])))
-    return found
-
-
-def gaussian(states: np.ndarray, widen: float = 1.0, independent: bool = False) -> list[Layer]:
+def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
     """Layers that turn standard normal noise n into a move, so that n and it have the moments.
 
-    The mean and covariance of n + move are those of the states, the deviations times `widen`.
-    relu(n + c) - c is n but for noise below -c. Numbers that are `independent` have no covariance.
+    The mean and covariance of n + move are those of the states. relu(n + c) - c is n but for noise
+    below -c. Numbers that are `independent` have no covariance.
     """
     mean, size = states.mean(axis=0), states.shape[1]
-    spread = widen**2 * np.cov(states, rowvar=False).reshape(size, size)
+    spread = np.cov(states, rowvar=False).reshape(size, size)
     if independent:
         spread = np.diag(np.diag(spread))
     # A number that does not vary keeps a deviation that is far below rounding.
@@ -197,20 +176,18 @@ def gaussian(states: np.ndarray, widen: float = 1.0, independent: bool = False) 
     return [(np.eye(size), shift), (kernel, mean - kernel @ shift)]
 
 
-def as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
+def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     """Weights of a network with equally wide hidden layers, which zeros fill up."""
-    *hidden, last = layers
-    size_in, found = hidden[0][0].shape[1], {}
-    for i, (kernel, bias) in enumerate([*hidden, last]):
-        rows = hidden_size if i < len(hidden) else len(bias)
-        columns = size_in if i == 0 else hidden_size
-        wide = np.zeros((rows, columns), np.float32)
-        wide[: kernel.shape[0], : kernel.shape[1]] = kernel
-        found[f"Dense_{i}"] = {
-            "kernel": wide,
-            "bias": np.pad(bias, (0, rows - len(bias))).astype(np.float32),
+    weights, width = {}, layers[0][0].shape[1]
+    for i, (kernel, bias) in enumerate(layers):
+        missing = hidden_size - len(bias) if i < len(layers) - 1 else 0
+        columns = (0, width - kernel.shape[1])
+        weights[f"Dense_{i}"] = {
+            "kernel": np.pad(kernel, ((0, missing), columns)).astype(np.float32),
+            "bias": np.pad(bias, (0, missing)).astype(np.float32),
         }
-    return found
+        width = hidden_size
+    return weights
 
 
 def evaluate(layers: Sequence[Layer], states: np.ndarray) -> np.ndarray:

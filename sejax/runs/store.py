@@ -145,6 +145,22 @@ class Store:
         write_bytes(self.path(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
         self._is_used = True
 
+    def once(
+        self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
+    ) -> dict[str, np.ndarray]:
+        """The tensors of an entry, which are computed and written unless it is there.
+
+        Raises:
+          ConfigError: as `get`.
+          OSError: as `put`.
+        """
+        entry = self.get(name)
+        if entry is not None:
+            return dict(entry.tensors)
+        tensors = dict(compute())
+        self.put(name, tensors)
+        return tensors
+
     def damaged(self, name: str, error: Exception) -> ConfigError:
         """The error for an entry that cannot be read, and why."""
         self._is_used = True

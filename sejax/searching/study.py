@@ -15,6 +15,7 @@ import filelock
 import numpy as np
 import optuna
 import pandas as pd
+from optuna.distributions import BaseDistribution
 from optuna.trial import Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -45,7 +46,7 @@ def usable(search: Search, *more: type[Exception]) -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except (optuna.exceptions.OptunaError, SQLAlchemyError, *more) as error:
+    except (optuna.exceptions.OptunaError, SQLAlchemyError, *more) as error:  # type: ignore[misc]
         raise ConfigError(
             f"search_dir must hold a database that can be used; got {search.folder / 'study.db'} "
             f"({told(error.__cause__ or error)}). Set search_dir=FOLDER.",
@@ -111,7 +112,9 @@ def work(study: optuna.Study, search: Search) -> None:
 def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) -> Trial | None:
     """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
     known = study.get_trials(deepcopy=False)
-    space = {x.parameter: x.distribution for x in search.space.values()}
+    space: dict[str, BaseDistribution] = {
+        x.parameter: x.distribution for x in search.space.values()
+    }
     for frozen in known:
         if frozen.state != TrialState.RUNNING:
             continue
