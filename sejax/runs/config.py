@@ -451,7 +451,7 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       7
     """
     composed = compose(LearnConfig, overrides)
-    return learn_config(composed.values, composed.imports)
+    return _from_plain(LearnConfig, composed.values, composed.imports)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
