@@ -118,6 +118,8 @@ def test_a_mixture_has_fields_for_each_agent():
 def test_an_agent_of_a_mixture_may_have_a_name_of_its_own():
     config = sejax.config(["agents=[ddqn,myopic]", "agents.myopic.name=ddqn",
                            "agents.myopic.discount=0", "agents.myopic.weight=2"])  # fmt: skip
+    words = ["agent=ddqn", *(f"agents.myopic.{x}" for x in ("name=ddqn", "discount=0", "weight=2"))]
+    assert sejax.config(words) == config
     sighted, myopic = config.agents.values()
     assert myopic.discount == 0.0
     assert sighted == sejax.config([]).agent, "with the settings of its preset"
