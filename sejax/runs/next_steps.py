@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sejax.proxies.header import agents_of
+
 
 def evaluate_words(proxy: Path | str, env_name: str, kind: str, agents: Sequence[str]) -> list[str]:
     """The overrides with which `sejax.evaluate` judges a proxy.
@@ -30,6 +32,4 @@ def title(stored: Mapping[str, Any]) -> str:
 
 def agent_names(stored: Mapping[str, Any]) -> list[str]:
     """The agents of a stored run, by the names of their choices."""
-    several = stored.get("agents") or {}
-    members = [each for each in several.values() if isinstance(each, dict)]
-    return [str(each["name"]) for each in members or [stored["agent"]]]
+    return [str(values["name"]) for values in agents_of(stored).values()]

@@ -23,7 +23,7 @@ from sejax.options import (
     require,
     shortened,
 )
-from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
+from sejax.options.plain import from_plain, parsed, split, to_plain
 from sejax.proxies import hub
 from sejax.runs import compose
 from sejax.runs import config as configuration
@@ -332,8 +332,7 @@ def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict
         "must be given, or ranges of fields; got none. Set space=paper_se, or "
         f"es.noise_std='{spaces.EXAMPLE}'.",
     )
-    values = flatten(configuration.plain(config))
-    values |= {group: values.get(f"{group}.name") for group in config.groups}
+    values = configuration.words_of(config)
     for name in search.space:
         if name not in values:
             raise ConfigError(
