@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
-from support import ended, paper_se
+from support import ended, paper_se, refusal
 
 import sejax
 from experiments import se_histograms
@@ -96,6 +96,7 @@ NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
 def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreign):
+    assert isinstance(refusal(configuration.learn_config, stored(**foreign)), sejax.ConfigError)
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
     rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}

@@ -10,7 +10,7 @@ import functools
 import os
 import re
 import typing
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -133,6 +133,9 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
             return value
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name, imports)
+    item = next(iter(typing.get_args(hint)), None)
+    if dataclasses.is_dataclass(item) and isinstance(value, list | tuple):
+        return tuple(_read(each, item, name, MISSING, imports) for each in value)
     if isinstance(value, str):
         text = expanded(value)
         candidates = parsed(text), text
@@ -143,10 +146,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
         try:
             read = _adapter(hint).validate_python(candidate)
         except ValidationError as error:
-            first = error.errors()[0]
-            must, steps = first["msg"].removeprefix("Input should "), first["loc"]
-            if steps and isinstance(steps[0], int):  # of a list of dataclasses
-                name = ".".join([name, *(step for step in steps if isinstance(step, str))])
+            must = error.errors()[0]["msg"].removeprefix("Input should ").partition(", unable")[0]
         else:
             if isinstance(candidate, bool) == isinstance(read, bool):  # which are numbers in Python
                 return read
@@ -198,17 +198,28 @@ def differences(
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
       'es.noise_std (0.1 there, 0.2 here)'
     """
-    old, asked = flatten(there), flatten(here)
-    differing = [
-        f"{name} ({shortened(old.get(name), 60)} there, {shortened(asked.get(name), 60)} here)"
-        for name in sorted(old.keys() | asked.keys())
+    found = [
+        f"{name} ({shortened(old, 60)} there, {shortened(new, 60)} here)"
+        for name, old, new in _differing(there, here)
         if name.partition(".")[0] not in free
-        # In the second way nan is nan.
-        and old.get(name) != asked.get(name)
-        and repr(old.get(name)) != repr(asked.get(name))
     ]
-    more = f" and {len(differing) - most} more" if len(differing) > most else ""
-    return ", ".join(differing[:most]) + more
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    return ", ".join(found[:most]) + more
+
+
+def _differing(
+    there: Mapping[str, Any], here: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    for key in sorted(there.keys() | here.keys(), key=str):
+        old, new, name = there.get(key), here.get(key), f"{prefix}{key}"
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from _differing(old, new, f"{name}.")
+        elif old != new and repr(old) != repr(new):  # by their texts nan is nan
+            yield name, _named(old), _named(new)
+
+
+def _named(value: Any) -> Any:
+    return value.get("name", "fields") if isinstance(value, Mapping) else value
 
 
 # --- texts ---------------------------------------------------------------------------------------

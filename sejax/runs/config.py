@@ -348,6 +348,15 @@ def plain(config: CommandConfig) -> dict[str, Any]:
     return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
 
 
+def words_of(config: CommandConfig) -> dict[str, Any]:
+    """The value of each field, by its name in words; that of a choice is its name."""
+    values = plain(config)
+    if len(config.agents) == 1:
+        values["agent"] = values.pop("agents").popitem()[1]
+    values = flatten(values)
+    return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
+
+
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
@@ -451,7 +460,7 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       7
     """
     composed = compose(LearnConfig, overrides)
-    return learn_config(composed.values, composed.imports)
+    return _from_plain(LearnConfig, composed.values, composed.imports)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:

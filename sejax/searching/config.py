@@ -19,7 +19,7 @@ from sejax.options import (
     require,
     shortened,
 )
-from sejax.options.plain import flatten, from_plain, parsed, split, to_plain, unknown_field
+from sejax.options.plain import from_plain, parsed, split, to_plain, unknown_field
 from sejax.proxies import hub
 from sejax.runs import compose
 from sejax.runs import config as configuration
@@ -125,20 +125,22 @@ class Search:
         return config
 
     @cached_property
+    def default(self) -> Any:
+        """The configuration of a trial whose overrides are the fixed ones."""
+        return self.trial_config([])
+
+    @property
     def plain(self) -> dict[str, Any]:
-        """The plain values of a trial whose overrides are the fixed ones; one agent is `agent`."""
-        values: dict[str, Any] = configuration.plain(self.trial_config([]))
-        if len(values["agents"]) == 1:
-            (values["agent"],) = values["agents"].values()
+        """The plain values of `default`."""
+        values: dict[str, Any] = configuration.plain(self.default)
         return values
 
     @property
     def agents(self) -> dict[str, str]:
         """The names of the agents that are trained, by the group of their fields."""
-        if "agent" in self.plain:
-            return {"agent": self.plain["agent"]["name"]}
-        members = {k: x for k, x in self.plain["agents"].items() if isinstance(x, Mapping)}
-        return {f"agents.{key}": str(values["name"]) for key, values in members.items()}
+        names = {key: registry.name_of("agent", x) for key, x in self.default.agents.items()}
+        is_one = len(names) == 1
+        return {"agent" if is_one else f"agents.{key}": name for key, name in names.items()}
 
     @property
     def study(self) -> str:
@@ -166,8 +168,7 @@ class Search:
             "must be given and have ranges for these agents, or ranges of fields; got none. Set "
             f"space=paper_se, or es.noise_std='{spaces.EXAMPLE}'.",
         )
-        values = flatten(self.plain)
-        values |= {name.removesuffix(".name"): value for name, value in values.items()}
+        values = configuration.words_of(self.default)
         for name in self.space:
             if name not in values:
                 raise unknown_field(name, values)
