@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
-from sejax.es.base import Groups, Strategy, StrategyState
+from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
 from sejax.generation import Candidates, GenerationEvaluator
 from sejax.objectives import MaxReward, Objective, Outcome
@@ -127,7 +127,7 @@ class Bilevel:
         )
 
     def tell(
-        self, state: LearnState, candidates: Candidates, outcomes: Groups[Outcome]
+        self, state: LearnState, candidates: Candidates, outcome: Outcome
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
@@ -135,12 +135,12 @@ class Bilevel:
         comparison, the search goes on to weights that teach under perturbation too.
         """
         # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
-        outcomes = jax.lax.optimization_barrier(outcomes)
-        compared = self.scoring.for_strategy(outcomes)
+        outcome = jax.lax.optimization_barrier(outcome)
+        compared = self.scoring.for_strategy(outcome)
         es_state = self.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        scores = self.scoring.judged(outcomes)
+        scores = self.scoring.judged(outcome)
         score, by_agent = or_lowest(scores.incumbent_mean), or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(
@@ -158,9 +158,7 @@ class Bilevel:
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved
-        return after, self.scoring.info(
-            scores, outcomes, state.generation, after.best_score, active
-        )
+        return after, self.scoring.info(scores, outcome, state.generation, after.best_score, active)
 
 
 def make_learner(

@@ -44,7 +44,9 @@ class Trainings:
 
 
 class GenerationEvaluator:
-    """`evaluate(candidates) -> Groups[Outcome]`: all trainings of a generation, and their tests.
+    """`evaluate(candidates) -> Outcome`: all trainings of a generation, and their tests.
+
+    Leaves are `[training, ...]`, those of a candidate in a row, and the incumbent's last.
 
     One program holds both groups: each agent's trainings, on candidates and on the incumbent, are
     spread over the devices, and on each of them batches of `num_parallel` follow one another. No
@@ -95,22 +97,21 @@ class GenerationEvaluator:
 
         self.runs = [run_with(evaluate) for evaluate in evaluators]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self._candidates = scoring.candidates
-        self._num_evals = scoring.evaluations.num_evals
-        num_turns = scoring.evaluations.num_incumbent_evals // len(agents)
-        self.sizes = [numbers.size * self._num_evals + num_turns for numbers in self._candidates]
+        self.sizes = [scoring.trainings_of(agent).size for agent in range(len(agents))]
+        self._scoring = scoring
         self._spread = spread_groups_over_devices(self.runs, devices, num_parallel, self.widths)
 
-    def __call__(self, candidates: Candidates) -> Groups[Outcome]:
-        by_agent = self._spread([(trainings,) for trainings in self.trainings(candidates)])
-        return self.outcomes(by_agent)
+    def __call__(self, candidates: Candidates) -> Outcome:
+        return self.joined(self._spread([(of_agent,) for of_agent in self.trainings(candidates)]))
 
     def trainings(self, candidates: Candidates) -> list[Trainings]:
         """The trainings of each agent: on its candidates, and then on the incumbent."""
         keys, shared = candidates.keys, (candidates.active, candidates.test_params)
         by_agent = []
-        for agent, (numbers, size) in enumerate(zip(self._candidates, self.sizes, strict=True)):
-            population = jnp.repeat(candidates.population[numbers], self._num_evals, axis=0)
+        num_evals = self._scoring.evaluations.num_evals
+        pairs = zip(self._scoring.candidates, self.sizes, strict=True)
+        for agent, (numbers, size) in enumerate(pairs):
+            population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
             incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
             active, test_params = jax.tree.map(lambda x, size=size: jnp.repeat(x, size), shared)
             trainings = Trainings(
@@ -122,20 +123,13 @@ class GenerationEvaluator:
             by_agent.append(trainings)
         return by_agent
 
-    def outcomes(self, by_agent: Sequence[Outcome]) -> Groups[Outcome]:
-        """The outcomes of `trainings`, by candidate and by turn of the incumbent."""
-        order = np.argsort(np.concatenate(self._candidates))
-        num_candidates = [numbers.size for numbers in self._candidates]
+    def joined(self, by_agent: Sequence[Outcome]) -> Outcome:
+        """The outcomes of all `trainings`: by candidate, and then by turn of the incumbent.
 
-        def population(*leaves: Array) -> Array:
-            by_candidate = [
-                leaf[: num * self._num_evals].reshape(num, self._num_evals, *leaf.shape[1:])
-                for leaf, num in zip(leaves, num_candidates, strict=True)
-            ]
-            return jnp.concatenate(by_candidate)[order]
-
-        def incumbent(*leaves: Array) -> Array:
-            pairs = zip(leaves, num_candidates, strict=True)
-            return jnp.stack([leaf[num * self._num_evals :] for leaf, num in pairs], axis=1)
-
-        return Groups(jax.tree.map(population, *by_agent), jax.tree.map(incumbent, *by_agent))
+        A single agent's stay as they are: XLA would round sums over a copy otherwise.
+        """
+        if len(by_agent) == 1:
+            return by_agent[0]
+        numbers = [self._scoring.trainings_of(agent) for agent in range(len(by_agent))]
+        order = np.argsort(np.concatenate(numbers))
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

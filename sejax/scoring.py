@@ -8,11 +8,10 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from sejax.agents.mixture import Mixture
 from sejax.es.base import Evaluations, Groups, Strategy
@@ -26,18 +25,20 @@ class Scores:
     """Scores of a generation.
 
     Attributes:
-      population: one for each training; not finite for agents that diverged.
-      incumbent: one for each training, agents that diverged ranked last.
+      population: one for each training, those of a candidate in a row; not finite for agents that
+        diverged.
+      incumbent: one for each training, the agents of a mixture in turns; agents that diverged rank
+        last.
       agent_means: the incumbent's mean with each agent of a mixture; nan where none survived.
       incumbent_mean: the incumbent's score; nan if no training with one agent survived.
-      diverged: whether the score of a training is not finite.
+      diverged: whether the score of a training is not finite; the incumbent's come last.
     """
 
-    population: Float[Array, "pop evaluation"]
-    incumbent: Float[Array, "turn agent"]
+    population: Float[Array, " evaluation"]
+    incumbent: Float[Array, " turn_agent"]
     agent_means: Float[Array, " agent"]
     incumbent_mean: Float[Array, ""]
-    diverged: Groups[Array]
+    diverged: Bool[Array, " training"]
 
 
 @struct.dataclass
@@ -110,98 +111,90 @@ class Scoring:
             evaluations=dataclasses.replace(strategy.evaluations, num_incumbent_evals=num_evals),
         )
 
-    def for_strategy(
-        self, outcomes: Groups[Outcome]
-    ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
-        """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
-        scores = self._scores(self.objective, outcomes)
-        population = self.evaluations.population_scores(scores.population)
+    def trainings_of(self, agent: int) -> np.ndarray:
+        """The numbers of an agent's trainings among all of a generation."""
+        of_population, of_incumbent = self._numbers(agent)
+        return np.concatenate([of_population, self._num_population + of_incumbent])
+
+    def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+        """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
+
+        Args:
+          outcome: of all trainings, as from `sejax.generation.GenerationEvaluator`.
+        """
+        scores = self._scores(self.objective(outcome))
+        by_candidate = scores.population.reshape(-1, self.evaluations.num_evals)
+        population = self.evaluations.population_scores(by_candidate)
         return self.mixture.comparable(population, self.candidates, scores.agent_means)
 
-    def judged(self, outcomes: Groups[Outcome]) -> Scores:
-        """The scores that people see."""
-        return self._scores(self.objective.judged, outcomes)
+    def judged(self, outcome: Outcome) -> Scores:
+        """The scores that people see, of all trainings."""
+        return self._scores(self.objective.judged(outcome))
 
     def info(
-        self,
-        scores: Scores,
-        outcomes: Groups[Outcome],
-        generation: Array,
-        best: Array,
-        active: Array,
+        self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
     ) -> GenerationInfo:
         """The statistics of a generation."""
-        population = scores.population.ravel()
-        train_steps = _each(lambda outcome: outcome.train_steps, outcomes)
-        num_steps = _flat(train_steps)
         return GenerationInfo(
             generation=generation,
             incumbent_mean=scores.incumbent_mean,
-            incumbent_std=jnp.nanstd(scores.incumbent.ravel()),
-            population_mean=finite_mean(population),
-            population_max=jnp.nanmax(population),
+            incumbent_std=jnp.nanstd(scores.incumbent),
+            population_mean=finite_mean(scores.population),
+            population_max=jnp.nanmax(scores.population),
             best_so_far=best,
-            train_steps_mean=num_steps.mean(),
-            train_steps_max=num_steps.max(),
-            train_episodes_mean=_flat(
-                _each(lambda outcome: outcome.train_episodes, outcomes)
-            ).mean(),
-            num_nonfinite=_flat(scores.diverged).sum(),
+            train_steps_mean=outcome.train_steps.mean(),
+            train_steps_max=outcome.train_steps.max(),
+            train_episodes_mean=outcome.train_episodes.mean(),
+            num_nonfinite=scores.diverged.sum(),
             by_agent=AgentInfo(
                 incumbent_mean=scores.agent_means,
-                population_mean=jnp.stack(
-                    [finite_mean(scores.population[numbers].ravel()) for numbers in self.candidates]
-                ),
-                train_steps_mean=self._by_agent(jnp.mean, train_steps),
+                population_mean=self._by_agent(finite_mean, scores.population),
+                train_steps_mean=self._by_agent(jnp.mean, outcome.train_steps),
                 num_nonfinite=self._by_agent(jnp.sum, scores.diverged),
             ),
-            population_scores=population,
-            train_steps=num_steps,
-            real_steps=_flat(_each(lambda outcome: outcome.real_steps, outcomes)),
+            population_scores=scores.population,
+            train_steps=outcome.train_steps,
+            real_steps=outcome.real_steps,
             active=active,
         )
 
-    def _scores(self, score: Callable[[Outcome], Array], outcomes: Groups[Outcome]) -> Scores:
-        population, incumbent = _each(lambda outcome: _scored(score, outcome), outcomes)
-        repaired, means = zip(
-            *(
-                self.evaluations.incumbent_scores(incumbent[:, agent], population[numbers].ravel())
-                for agent, numbers in enumerate(self.candidates)
-            ),
-            strict=True,
-        )
+    def _scores(self, scores: Float[Array, " training"]) -> Scores:
+        population, incumbent = jnp.split(scores, [self._num_population])
+        means = []
+        for agent in range(self.mixture.size):
+            of_population, of_incumbent = self._numbers(agent)
+            repaired, mean = self.evaluations.incumbent_scores(
+                incumbent[of_incumbent], population[of_population]
+            )
+            incumbent = incumbent.at[of_incumbent].set(repaired)
+            means.append(mean)
         agent_means = jnp.stack(means)
         return Scores(
             population=population,
-            incumbent=jnp.stack(repaired, axis=1),
+            incumbent=incumbent,
             agent_means=agent_means,
             incumbent_mean=self.mixture.aggregated(agent_means),
-            diverged=Groups(~jnp.isfinite(population), ~jnp.isfinite(incumbent)),
+            diverged=~jnp.isfinite(scores),
         )
+
+    @property
+    def _num_population(self) -> int:
+        """Trainings on the population."""
+        return sum(numbers.size for numbers in self.candidates) * self.evaluations.num_evals
+
+    def _numbers(self, agent: int) -> Groups[np.ndarray]:
+        """The numbers of an agent's trainings within each group."""
+        num_evals, num_agents = self.evaluations.num_evals, self.mixture.size
+        of_population = np.add.outer(self.candidates[agent] * num_evals, np.arange(num_evals))
+        of_incumbent = np.arange(agent, self.evaluations.num_incumbent_evals, num_agents)
+        return Groups(of_population.ravel(), of_incumbent)
 
     def _by_agent(
-        self, statistic: Callable[[Array], Array], values: Groups[Array]
-    ) -> Float[Array, " agent"]:
-        """A statistic of each agent's trainings."""
-        return jnp.stack(
-            [
-                statistic(_flat(Groups(values.population[numbers], values.incumbent[:, agent])))
-                for agent, numbers in enumerate(self.candidates)
-            ]
-        )
-
-
-def _each(function: Callable[[Outcome], Array], outcomes: Groups[Outcome]) -> Groups[Array]:
-    return Groups(function(outcomes.population), function(outcomes.incumbent))
-
-
-def _flat(values: Groups[Array]) -> Array:
-    """The values of all trainings, `[training]`; the incumbent's come last."""
-    return jnp.concatenate([values.population.ravel(), values.incumbent.ravel()])
-
-
-def _scored(score: Callable[[Outcome], Array], outcome: Outcome) -> Float[Array, "i j"]:
-    """Scores of outcomes with two leading axes, of a function for outcomes with one."""
-    shape = outcome.nonfinite.shape
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), outcome)
-    return score(flat).reshape(shape)
+        self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
+    ) -> Shaped[Array, " agent"]:
+        """A statistic of each agent's trainings, of the population alone if there are no more."""
+        statistics = []
+        for agent in range(self.mixture.size):
+            numbers = self.trainings_of(agent)
+            statistics.append(statistic(values[numbers[numbers < values.size]]))
+        return jnp.stack(statistics)

@@ -133,7 +133,7 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     outcome = jax.jit(lambda: jax.lax.map(run, trainings))()
     assert (outcome.scored_returns != outcome.test_returns).any()
     after, info = jax.jit(program.generation)(state)
-    expected, expected_info = program.tell(state, candidates, program.evaluate.outcomes([outcome]))
+    expected, expected_info = program.tell(state, candidates, outcome)
     np.testing.assert_allclose(after.es_state.mean, expected.es_state.mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(info.incumbent_mean, expected_info.incumbent_mean, rtol=1e-6)
 
@@ -161,8 +161,7 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
         test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
         auc=part[..., 0], nonfinite=counts < 0, real_steps=counts,
     )  # fmt: skip
-    outcomes = program.evaluate.outcomes([outcome])
-    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcomes)))(
+    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
         state
     )
     # All Better 2 with one member that is better: the mean moves to it.

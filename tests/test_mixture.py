@@ -14,7 +14,6 @@ import sejax
 from sejax import envs
 from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
-from sejax.es.base import Groups
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
 from sejax.objectives import MaxReward, Outcome
@@ -144,17 +143,12 @@ def scoring_of(weights, es, **config):
     return Scoring.of(MaxReward().make(TASK), es.make(4), agents)
 
 
-def outcomes_of(population, incumbent, num_agents):
-    """Outcomes of these test returns; nan for agents that diverged. The incumbent's take turns."""
-    incumbent = np.reshape(incumbent, (-1, num_agents))
-    return Groups(outcome_of(np.reshape(population, (-1, 1))), outcome_of(incumbent))
-
-
 def outcome_of(returns):
+    """The outcome of agents with these test returns; nan for those that diverged."""
     returns = jnp.float32(returns)
     counts = jnp.ones(returns.shape, jnp.int32)
     return Outcome(
-        test_returns=returns[..., None], scored_returns=returns[..., None], train_steps=counts,
+        test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
         train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
     )  # fmt: skip
 
@@ -172,12 +166,12 @@ def test_an_incumbents_score_aggregates_the_means_of_its_agents(aggregate, weigh
     es = NESConfig(population_size=4, num_incumbent_evals=len(weights))
     scoring = scoring_of(weights, es, aggregate=aggregate)
     means = [200.0, 10.0, 140.0][: len(weights)]
-    scores = scoring.judged(outcomes_of([7.0] * 8, means, len(means)))
+    scores = scoring.judged(outcome_of([7.0] * 8 + means))
     np.testing.assert_allclose(scores.incumbent_mean, score, rtol=1e-6)
     # People see returns.
     np.testing.assert_array_equal(scores.agent_means, means)
-    np.testing.assert_array_equal(scores.incumbent, [means])
-    np.testing.assert_array_equal(scores.population, [[7.0]] * 8)
+    np.testing.assert_array_equal(scores.incumbent, means)
+    np.testing.assert_array_equal(scores.population, [7.0] * 8)
 
 
 # --- Algorithm 1 ---------------------------------------------------------------------------------
@@ -206,10 +200,10 @@ def two():
     @jax.jit
     def generation(state):
         candidates = bilevel.ask(state)
-        outcomes = bilevel.evaluate(candidates)
-        return candidates, outcomes, *bilevel.tell(state, candidates, outcomes)
+        outcome = bilevel.evaluate(candidates)
+        return candidates, outcome, *bilevel.tell(state, candidates, outcome)
 
-    candidates, outcomes, after, info = generation(state)
+    candidates, outcome, after, info = generation(state)
     # Candidates 0 1 0 of each sign, two evaluations each; four of the incumbent, 3 rounded up.
     agent = np.array([0, 0, 1, 1, 0, 0] * 2 + [0, 1, 0, 1])
     by_agent = []
@@ -228,18 +222,13 @@ def two():
     assert np.mean(by_agent[0].auc != by_agent[1].auc) > 0.5  # the agents differ on most
     expected = jax.tree.map(lambda *x: np.stack([x[a][i] for i, a in enumerate(agent)]), *by_agent)
     return SimpleNamespace(
-        bilevel=bilevel, before=state, candidates=candidates, outcomes=outcomes, after=after,
+        bilevel=bilevel, before=state, candidates=candidates, outcome=outcome, after=after,
         info=info, agent=agent, expected=expected,
     )  # fmt: skip
 
 
 def test_each_candidate_is_trained_by_its_agent_and_no_other(two):
-    population, incumbent = jax.device_get(two.outcomes)
-    assert population.auc.shape == (6, 2) and incumbent.auc.shape == (2, 2)
-    flat = jax.tree.map(
-        lambda *x: np.concatenate([y.reshape(-1, *y.shape[2:]) for y in x]), population, incumbent
-    )
-    jax.tree.map(np.testing.assert_array_equal, flat, two.expected)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(two.outcome), two.expected)
 
 
 def test_a_generation_tells_the_advantages_over_each_agents_incumbent(two):
@@ -299,9 +288,9 @@ def told(incumbents, state=None, stop_when_solved=True, **config):
         Mixture(agents=AGENTS, config=MixtureConfig(**config)), stop_when_solved=stop_when_solved,
         es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=len(incumbents)),
     )  # fmt: skip
-    outcomes = outcomes_of([0, 0], incumbents, 2)
+    outcome = outcome_of([0, 0, *incumbents])
     state = bilevel.init(KEY) if state is None else state
-    return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcomes))(state)
+    return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcome))(state)
 
 
 @pytest.mark.parametrize(("aggregate", "score"), [("mean", 0.25), ("min", -0.25)])

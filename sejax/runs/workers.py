@@ -198,8 +198,8 @@ class RemoteChunks:
 
         def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
             candidates = self.learner.ask(state)
-            outcomes = self.learner.evaluate.outcomes(by_agent)
-            return self.learner.tell(state, candidates, outcomes), _sent(self.learner, candidates)
+            outcome = self.learner.evaluate.joined(by_agent)
+            return self.learner.tell(state, candidates, outcome), _sent(self.learner, candidates)
 
         def evaluate(state: LearnState) -> list[Outcome]:
             trainings = self.learner.evaluate.trainings(self.learner.ask(state))
