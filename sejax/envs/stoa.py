@@ -7,10 +7,10 @@ continuous actions lie in [-1, 1]. A suite is installed beside sejax's
 extra `stoa`. Two players, or several actions at once, do not fit an agent of sejax.
 """
 
-import importlib
 import math
+import pkgutil
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -28,29 +28,16 @@ PREFIX = "stoa/"
 LIMITS = ("max_steps", "max_timesteps", "time_limit", "episode_length")  # as suites call it
 
 
-class Suite(NamedTuple):
-    """Where a suite makes its environments, and which of stoa's classes takes them.
-
-    Attributes:
-      module, maker: a function of the id.
-      adapter: in `stoa.env_adapters`, a module and a class.
-    """
-
-    module: str
-    maker: str
-    adapter: tuple[str, str]
-
-
+# Of each suite the function that makes an environment of an id, and, in `stoa.env_adapters`, the
+# class that takes it.
 SUITES = {
-    "brax": Suite("brax.envs", "get_environment", ("brax", "BraxToStoa")),
-    "craftax": Suite("sejax.envs.stoa", "make_craftax", ("gymnax", "GymnaxToStoa")),
-    "jumanji": Suite("jumanji", "make", ("jumanji", "JumanjiToStoa")),
-    "navix": Suite("navix", "make", ("navix", "NavixToStoa")),
-    "pgx": Suite("pgx", "make", ("pgx", "PGXToStoa")),
-    "playground": Suite(
-        "sejax.envs.stoa", "make_playground", ("playground", "MuJoCoPlaygroundToStoa")
-    ),
-    "xminigrid": Suite("xminigrid", "make", ("xminigrid", "XMiniGridToStoa")),
+    "brax": ("brax.envs:get_environment", "brax:BraxToStoa"),
+    "craftax": ("sejax.envs.stoa:make_craftax", "gymnax:GymnaxToStoa"),
+    "jumanji": ("jumanji:make", "jumanji:JumanjiToStoa"),
+    "navix": ("navix:make", "navix:NavixToStoa"),
+    "pgx": ("pgx:make", "pgx:PGXToStoa"),
+    "playground": ("sejax.envs.stoa:make_playground", "playground:MuJoCoPlaygroundToStoa"),
+    "xminigrid": ("xminigrid:make", "xminigrid:XMiniGridToStoa"),
 }
 
 
@@ -77,12 +64,11 @@ class StoaTask(Options):
         suite, _, name = self.name.removeprefix(PREFIX).partition("/")
         if suite not in SUITES or not name:
             raise options.unknown_name("env", self.name, [f"{PREFIX}{x}/ID" for x in SUITES])
-        module, maker, (adapter, of) = SUITES[suite]
+        maker, adapter = SUITES[suite]
         try:
-            theirs = getattr(importlib.import_module(module), maker)(name)
-            adapted = getattr(importlib.import_module(f"stoa.env_adapters.{adapter}"), of)
+            theirs = pkgutil.resolve_name(maker)(name)
             args = theirs if isinstance(theirs, tuple) else (theirs,)  # with its params
-            env = adapted(*args)
+            env = pkgutil.resolve_name(f"stoa.env_adapters.{adapter}")(*args)
         except Exception as error:
             is_missing = isinstance(error, ImportError)
             install = f"Install it with pip install 'sejax[stoa]' {suite}."
