@@ -293,12 +293,14 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         Raises:
           ConfigError: for seeds or a mask of another length.
         """
-        n, seeds = self.num_envs, seed
+        n = self.num_envs
+        seeds = seed
         if seeds is None or isinstance(seeds, int | np.integer):
             seeds = [None if seeds is None else int(seeds) + i for i in range(n)]
         mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
-        is_mask, got = mask.shape == (n,) and mask.dtype == np.bool_, f"{mask.shape} {mask.dtype}"
         require(len(seeds) == n, "seed", f"must be one number, or {n}; got {len(seeds)}.")
+        is_mask = mask.shape == (n,) and mask.dtype == np.bool_
+        got = f"{mask.shape} of {mask.dtype}"
         require(is_mask, "options.reset_mask", f"must be [{n}] of bool; got {got}.")
         for i in np.flatnonzero(mask).tolist():
             if self._np_random[i] is None or seeds[i] is not None:
@@ -333,21 +335,26 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             terminated[on], truncated[on] = step.terminated, step.truncated
         self._begin(self._ended)
         self._ended = ended = terminated | truncated
-        infos: Info = _told(discounts, on)
+        infos = _told(discounts, on)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            final_obs = np.full(self.num_envs, None)
-            obs = self.world.observe(self._vectors)
-            for i in np.flatnonzero(ended):
-                final_obs[i] = obs[i]
-            finals = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-            masks = {"_final_obs": ended, "_final_info": ended}
-            infos = finals | masks | _told(discounts, ~ended)
+            infos = self._finals(ended, discounts)
             self._begin(ended)
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
 
+    def _finals(self, ended: np.ndarray, discounts: np.ndarray) -> Info:
+        """Infos of a step whose ended environments begin anew at once."""
+        obs = self.world.observe(self._vectors)
+        final_obs = np.full(self.num_envs, None)
+        for i in np.flatnonzero(ended):
+            final_obs[i] = obs[i]
+        finals = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
+        masks = {"_final_obs": ended, "_final_info": ended}
+        return finals | masks | _told(discounts, ~ended)
+
     def _begin(self, mask: np.ndarray) -> None:
         """Puts environments at the beginning of an episode."""
-        indices, num_drawn = np.flatnonzero(mask), self._drawn.shape[1]
+        indices = np.flatnonzero(mask)
+        num_drawn = self._drawn.shape[1]
         if not indices.size:
             return
         for i in indices[self._num_used[indices] == num_drawn]:

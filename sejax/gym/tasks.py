@@ -130,7 +130,8 @@ def real_env(header: Header, fix: str, **options: Any) -> Env:
       ConfigError: if there is none, for an option that the task does not have here, or if Gymnasium
         cannot make it.
     """
-    config, limit = header.config["env"], header.spec.max_steps
+    config = header.config["env"]
+    limit = header.spec.max_steps
     name = str(config.get("name"))
     is_known = name in GYMNASIUM_IDS or name in MAPS
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
@@ -159,7 +160,8 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
       ConfigError: if it must be given, or the one given has other actions or another step limit
         than the file's.
     """
-    learned, limit = RealTask.of_spec(header.spec), header.spec.max_steps
+    learned = RealTask.of_spec(header.spec)
+    limit = learned.max_steps
     if task is None and not config.needs_task:
         return learned
     # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
@@ -172,7 +174,8 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
         task = RealTask.of_gymnasium(task, limit)
     got = f"got {shortened(task)}. Set task=sejax.gym.RealTask.of_env(env)."
     require(isinstance(task, RealTask), "task", f"must be a RealTask or an id of Gymnasium; {got}")
-    actions, wanted = task.action_space, learned.action_space
+    actions = task.action_space
+    wanted = learned.action_space
     has_actions = is_same_space(space_of(actions, "task.action_space"), header.spec.action)
     got = f"got {shortened(actions)}. gymnasium.wrappers.RescaleAction makes such."
     require(has_actions, "task", f"must have the actions of the SE's task, {wanted}; {got}")
