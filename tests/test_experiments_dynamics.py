@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import t as student
 from support import paper_se, refuse, refused
 from test_experiments import save_ses
 
@@ -15,6 +14,7 @@ import sejax
 from experiments import se_dynamics, se_myopia
 from experiments.common import runs
 from experiments.common.agents import OUTCOMES
+from experiments.common.statistics import mean_interval
 
 # --- the myopia test ------------------------------------------------------------------------------
 
@@ -29,28 +29,22 @@ def agent_rows(group, by_discount):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("myopic", "far", "verdict"),
-    [
-        ([98, 99, 100, 101, 102], [100, 100, 100, 100, 100], "policy"),
-        ([0, 1, 2, 3, 4], [98, 99, 100, 101, 102], "dynamics"),
-        ([0, 1, 2, 3, 4], [3, 4, 2, 1, 0], "teaches little"),
-        ([0, 100, 0, 100, 0], [100, 100, 100, 100, 100], "open"),
-        ([0, 100, 0, 100, 0], [0, 100, 0, 100, 0], "open"),  # equal, but does it teach anything?
-        ([100, 100, 100, 100, 100], [0, 0, 0, 0, 0], "teaches little"),
-        ([0, 0, 0, 0], [100, 100, 100, 100], "open"),  # too few agents for an interval
-    ],
-)
+@pytest.mark.parametrize(("myopic", "far", "verdict"), [
+    ([98, 99, 100, 101, 102], [100, 100, 100, 100, 100], "policy"),
+    ([0, 1, 2, 3, 4], [98, 99, 100, 101, 102], "dynamics"),
+    ([0, 1, 2, 3, 4], [3, 4, 2, 1, 0], "teaches little"),
+    ([0, 100, 0, 100, 0], [100, 100, 100, 100, 100], "open"),
+    ([0, 100, 0, 100, 0], [0, 100, 0, 100, 0], "open"),  # equal, but does it teach anything?
+    ([100, 100, 100, 100, 100], [0, 0, 0, 0, 0], "teaches little"),
+    ([0, 0, 0, 0], [100, 100, 100, 100], "open"),  # too few agents for an interval
+])  # fmt: skip
 def test_a_verdict_is_read_off_intervals(myopic, far, verdict):
     rows = agent_rows("a", {0.0: myopic, 0.5: [7] * len(far), 0.99: far})
     (found,) = se_myopia.verdicts(rows, 0.0, 100.0).to_dict("records")
     assert found["verdict"] == verdict and found["group"] == "a"
     lost = np.subtract(far, myopic)
-    assert found["loss"] == pytest.approx(lost.mean())
-    if len(lost) >= 5:
-        half = student.ppf(0.975, 4) * lost.std(ddof=1) / 5**0.5
-        ends = [lost.mean() - half, lost.mean() + half]
-        assert [found["loss_low"], found["loss_high"]] == pytest.approx(ends)
+    expected = [lost.mean(), *mean_interval(lost)]
+    np.testing.assert_allclose([found[x] for x in ("loss", "loss_low", "loss_high")], expected)
 
 
 def test_sets_are_summarised_over_their_ses_and_share_those_that_are_in_both():
@@ -123,29 +117,26 @@ def test_a_run_costs_what_it_spent_until_its_first_incumbent_that_solves():
     assert [solved[x] for x in reached] == [3, 100, 50, 30, 2]
 
 
-def test_kinds_are_summarised_whatever_runs_are_finished():
-    """The second seed of the kind with dynamics is still to come."""
+def test_kinds_are_summarised_over_their_runs():
     curves = pd.concat([curve_rows("bandit", 0, [100]), curve_rows("bandit", 1, [0, 0]),
                         curve_rows("soft", 0, [0, 100, 100])])  # fmt: skip
 
     def agents(kind, seed, myopic, far, fresh):
-        group = f"seed{seed}"
-        sighted = agent_rows(group, {0.0: [myopic] * 5, 0.99: [far] * 5})
-        students = agent_rows(group, {np.nan: [fresh] * 5}).assign(student="ddqn")
-        return pd.concat([sighted, students]).assign(kind=kind, seed=seed)
+        students = {np.nan: [fresh] * 5, 0.0: [myopic] * 5, 0.99: [far] * 5}
+        rows = agent_rows(f"seed{seed}", students).assign(kind=kind, seed=seed)
+        return rows.assign(student=np.where(rows["discount"].isna(), "ddqn", None))
 
     rows = pd.concat([agent_rows("untrained", {np.nan: [-1.0, 1.0]}),
                       agents("bandit", 0, 100, 100, 80), agents("bandit", 1, 0, 0, 20),
                       agents("soft", 0, 10, 100, 40)])  # fmt: skip
-    bandit, soft = se_dynamics.summarise(curves, rows, 100.0).to_dict("records")
-    told = ("kind", "runs", "first_solved", "solved", "generations_to_solve", "untrained")
-    assert [bandit[x] for x in told] == ["bandit", 2, 1, 1, np.inf, 0]
-    assert [soft[x] for x in told] == ["soft", 1, 1, 1, 2, 0]
-    assert [bandit[x] for x in ("policy", "teaches little", "dynamics")] == [1, 1, 0]
-    assert [soft[x] for x in ("policy", "teaches little", "dynamics")] == [0, 0, 1]
-    means = [(x["on_ddqn_mean"], x["return_0_mean"], x["return_0_99_mean"]) for x in (bandit, soft)]
-    assert means == [(50, 50, 50), (40, 10, 100)]
-    assert bandit["episode_steps"] == 5, "100 steps in 20 episodes"
+    found = se_dynamics.summarise(curves, rows, 100.0).set_index("kind").T
+    expected = {
+        "runs": (2, 1), "first_solved": (1, 1), "solved": (1, 1), "untrained": (0, 0),
+        "generations_to_solve": (np.inf, 2), "policy": (1, 0), "teaches little": (1, 0),
+        "dynamics": (0, 1), "on_ddqn_mean": (50, 40), "return_0_mean": (50, 10),
+        "return_0_99_mean": (50, 100), "episode_steps": (5, 5),  # 100 steps in 20 episodes
+    }  # fmt: skip
+    assert {name: tuple(found.loc[name]) for name in expected} == expected
 
 
 def test_kinds_differ_in_their_proxy():

@@ -178,15 +178,12 @@ def test_the_summary_is_over_agents():
 
 def test_shares_are_of_the_groups_of_the_same_seeds():
     # Steps to solve of group g: 140 + 20 g and 150 + 20 g.
-    worlds = pd.concat([curves_of("real", 5), curves_of("icm", 2), curves_of("real_rn", 5)])
-    summary = rn_curves.summarise(worlds, max_steps=300).set_index("world")
-    assert summary["steps_mean"].tolist() == [185, 155, 185]
+    turned = pd.concat([curves_of("icm", 2), curves_of("real", 5), curves_of("real_rn", 5)])
+    summary = rn_curves.summarise(turned, max_steps=300)
+    assert summary["steps_mean"].tolist() == [155, 185, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
-    turned = pd.concat([curves_of("icm", 1), curves_of("real", 5)])  # in whatever order
-    assert rn_curves.summarise(turned, max_steps=300)["share_of_bare"].tolist() == [1, 1]
     alone = rn_curves.summarise(curves_of("icm", 2), max_steps=300)
-    (cells,) = rn_curves.make_table(alone).to_dict("records")
-    assert np.isnan(alone["share_of_bare"][0]) and cells["of the bare agent's"] == ""
+    assert rn_curves.make_table(alone)["of the bare agent's"].tolist() == [""]
 
 
 @pytest.mark.parametrize(("world", "groups", "drawn", "independent"), [
