@@ -6,7 +6,6 @@ machine are left alone: ports and folders are our own, and so are the processes 
 
 import contextlib
 import importlib.util
-import itertools
 import os
 import random
 import secrets
@@ -217,29 +216,6 @@ def wanted(tmp_path_factory):
     return results(folder)
 
 
-@pytest.fixture(scope="module")
-def seconds(cluster, wanted, tmp_path_factory):
-    """How long the generations of an undisturbed run take, the first from its first worker on."""
-    folder, ends = tmp_path_factory.mktemp("undisturbed"), []
-    with Driver(folder, "machines=ray", environment=cluster.environment) as driver:
-        wait_for(cluster.workers)
-        started = time.monotonic()
-        for generation in range(GENERATIONS):
-            wait_for(lambda: driver.generations() > generation)  # noqa: B023
-            ends.append(time.monotonic())
-        driver.wait()
-    assert results(folder) == wanted
-    return [end - before for before, end in itertools.pairwise([started, *ends])]
-
-
-def wait_until(moment, driver, seconds):
-    """Waits for a moment of a run, in generations; never for its end, however fast it is here."""
-    wait_for(lambda: driver.generations() >= int(moment))
-    end = time.monotonic() + moment % 1 * seconds[int(moment)]
-    while time.monotonic() < end and driver.generations() < GENERATIONS - 1:
-        time.sleep(0.01)
-
-
 def kill_worker(cluster, driver, rng):
     os.kill(rng.choice(wait_for(cluster.workers)), signal.SIGKILL)
 
@@ -265,19 +241,17 @@ def kill_driver(cluster, driver, rng):
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("fault", [kill_worker, kill_node, lose_node, kill_driver])
 def test_a_run_has_the_same_rows_whatever_is_killed_and_when(
-    cluster, wanted, seconds, tmp_path, fault, seed
+    cluster, wanted, tmp_path, fault, seed
 ):
     rng = random.Random(f"{fault.__name__} {seed}")
     with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
         wait_for(cluster.workers)
-        moment = rng.uniform(0, GENERATIONS - 1)
-        wait_until(moment, driver, seconds)
-        saved, there = driver.generations(), set(cluster.workers())
-        started = time.monotonic()
+        moment = rng.uniform(0, GENERATIONS - 4)  # in generations of some 0.2 s
+        wait_for(lambda: driver.generations() >= int(moment))
+        time.sleep(moment % 1 * 0.2)
+        there = set(cluster.workers())
         with fault(cluster, driver, rng) or contextlib.nullcontext(driver) as last:
             last.wait()
-    took = time.monotonic() - started
-    print(f"{fault.__name__} after {moment:.2f} generations, {saved} saved; {took:.1f} s more")
     assert results(tmp_path) == wanted
     wait_for(lambda: not any(map(is_there, there)))
 

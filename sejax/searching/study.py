@@ -217,7 +217,7 @@ def report(study: optuna.Study, search: Search) -> None:
     print(best.head(SHOWN).to_string(index=False))
     if search.config.verify:
         best = verified(study, search, best.head(search.config.verify))
-    line = write_best(shlex.split(best["settings"].iloc[0]), search)
+    line = write_best(_overrides(study, search, best["number"].iloc[0]), search)
     # A module that a file names is not imported, so it is typed beside it.
     typed = [word for word in search.fixed if ":" in word]
     preset = f"preset={as_text(str(search.folder / 'preset.yaml'))}"
@@ -239,7 +239,7 @@ def verified(study: optuna.Study, search: Search, best: pd.DataFrame) -> pd.Data
         for row in best.drop(columns=["generations", "train_steps"]).to_dict("records"):
             name = f"verified/{row['number']:04d}-{search.config.fresh_seeds}"
             if name not in study.user_attrs:
-                overrides = shlex.split(row["settings"])
+                overrides = _overrides(study, search, row["number"])
                 study.set_user_attr(name, _tried_again(search, overrides, search.folder / name))
             rows.append({**row, **study.user_attrs[name]})
     order = ["verified", "verified_cost"]
@@ -251,6 +251,11 @@ def verified(study: optuna.Study, search: Search, best: pd.DataFrame) -> pd.Data
         agreed = found[returns].corr(method="spearman").iloc[0, 1]
         print(f"Rank correlation of the two returns: {agreed:.2f}.")
     return found
+
+
+def _overrides(study: optuna.Study, search: Search, number: int) -> list[str]:
+    """The settings of a trial; of what a study stores only values of searched fields are used."""
+    return search.overrides(study.get_trials(deepcopy=False)[number].params)
 
 
 def _tried_again(search: Search, overrides: Sequence[str], folder: Path) -> dict[str, float]:
