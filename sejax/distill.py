@@ -179,7 +179,7 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
         lessons, costs = searched(own.search, task, num_lessons, keys, store, config.devices)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
-        lessons, costs = copied(own.copy, task, own.policy, keys, own.independent_starts)
+        lessons, costs = copied(own.copy, task, own.policy, keys)
     store.put(CHECKPOINT)
     made = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
     env, weights = made[0][0], [weights for _, weights in made]

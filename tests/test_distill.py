@@ -20,7 +20,7 @@ QUICK = (
     *("search.num_directions=4", "search.num_top=2", "search.generations=4", "num_snapshots=2"),
     *("search.test_every=1", "search.num_tests=2", "search.num_starts=2"),
     *("search.start_generations=2", "training.max_steps=60", "training.test_episodes=2"),
-    *("copy.episodes=2", "copy.steps=300", "copy.hidden_size=4"),
+    *("copy.rounds=1", "copy.episodes=2", "copy.steps=300", "copy.hidden_size=4"),
 )
 POLICY = f"policy={__name__}:act"
 SIGN = 1.0  # of the policy that a test distils by its name

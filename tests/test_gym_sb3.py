@@ -125,7 +125,7 @@ def test_a_model_of_theirs_is_a_policy_to_distil(tmp_path, name, task):
     obs = np.random.default_rng(0).normal(size=(9, *model.observation_space.shape)).astype("f4")
     np.testing.assert_allclose(act(obs), model.predict(obs, deterministic=True)[0])
     main([
-        *(f"env={task}", f"policy=ppo:{tmp_path}/model.zip", "copy.episodes=2"),
+        *(f"env={task}", f"policy=ppo:{tmp_path}/model.zip", "copy.rounds=1", "copy.episodes=2"),
         *("copy.steps=50", "num_tested=2", "training.max_steps=600", "training.max_episodes=600"),
         *("devices=1", f"run_dir={tmp_path}/run"),
     ])  # fmt: skip

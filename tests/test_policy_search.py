@@ -10,7 +10,7 @@ import pytest
 from support import assert_equal, refused
 
 from sejax import envs
-from sejax.distillation.policies import CopyConfig, acting, copied, visit
+from sejax.distillation.policies import CopyConfig, acting, copied, erring, visit
 from sejax.distillation.policy_search import (
     Policy,
     SearchConfig,
@@ -113,7 +113,7 @@ def test_tasks_without_vectors_are_refused():
 # --- copies --------------------------------------------------------------------------------------
 
 KEYS = dict(zip(("search", "record"), jax.random.split(jax.random.key(0)), strict=True))
-COPY = CopyConfig(hidden_size=0, episodes=4, steps=1500, agent_steps=50)
+COPY = CopyConfig(rounds=4, episodes=4, steps=3000, agent_steps=50)
 
 
 def swings_up(obs):
@@ -133,14 +133,22 @@ def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most):
     (lesson,), costs = copied(config, task, f"{__name__}:{policy.__name__}", KEYS)
     assert len(lesson.layers) == 1 + (hidden_size > 0)
     error = acting(task, lesson.layers)(lesson.states) - policy(lesson.states)
-    print(np.sqrt((error**2).mean()))
     assert np.sqrt((error**2).mean()) < most
-    assert len(lesson.states) < costs["real_steps"].item() <= 2 * 4 * task.max_steps
+    assert len(lesson.states) < costs["real_steps"].item() <= 5 * 4 * task.max_steps
 
 
 def test_an_agent_is_trained_on_the_task_and_copied():
     (lesson,), costs = copied(COPY, CARTPOLE, "ddqn", KEYS)
     assert costs["real_steps"].item() > COPY.agent_steps + len(lesson.states)
+
+
+def test_errors_have_their_size_and_do_not_depend_on_who_has_ended():
+    states, key = RNG.normal(size=(4000, 3)), jax.random.key(3)
+    act = erring(PENDULUM, [(np.zeros((1, 3)), np.zeros(1))], states, key, 4000)
+    errors = act(states)
+    assert 0.17 < np.sqrt((errors**2).mean()) < 0.25  # of a bound of 2, with the bias's part
+    states[1:] *= 1e4  # as of episodes that go on after their end
+    assert act(states)[0] == errors[0]
 
 
 def test_visits_are_whole_episodes():

@@ -1,10 +1,16 @@
 """Policies that `python -m sejax.distill` is given, and their copies in the form of an exact SE.
 
-A policy is a model of Stable-Baselines3, a function, or an agent of sejax. Its copy is a network of
-affine maps with ReLUs between, fitted to what the policy does in states that it visits, and in
-states where episodes of the SE begin: nowhere else does the SE show its reward.
+A policy is a model of Stable-Baselines3, a function, or an agent of sejax. Its copy, affine maps
+with ReLUs between, is fitted to what the policy does in states that both visit. In each round the
+copy plays, with an emulated error of its own in each episode, the policy says what it would have
+done, and the copy is fitted to all that was seen: states that a rough student gets into are among
+them.
+
+Source: Ross et al., "A reduction of imitation learning and structured prediction to no-regret
+online learning" (DAgger, 2011). The emulated error is ours.
 """
 
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,15 +24,16 @@ import pandas as pd
 from jaxtyping import Array, Float
 
 from sejax.agents import make_agent
-from sejax.distillation.policy_search import Lesson
+from sejax.distillation.policy_search import Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import ConfigError, Options, counts, option, registry, require, shortened, told
-from sejax.proxies.exact import Layer, evaluate, gaussian, require_vectors
+from sejax.proxies.exact import Layer, evaluate, require_vectors
 from sejax.training import TrainingConfig, make_trainer
 
 # Observations [state, obs_dim] to actions [state] or [state, action_dim], of NumPy.
 Actor = Callable[[np.ndarray], np.ndarray]
 FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), module:function, or an agent such as ppo."
+_POLICY_ERROR = 0.1  # of a copy in an episode, root mean square in units of the action's bound
 _BATCH_SIZE, _LEARNING_RATE = 256, 3e-3  # of the fit, by Adam
 _OVERSHOOT = 0.05  # weight of what lies beyond the bounds, where clipping has no slope
 
@@ -38,8 +45,9 @@ class CopyConfig(Options):
     group: ClassVar[str] = "copy"
 
     hidden_size: int = option(32, counts("0 is a linear copy", least=0))  # ReLUs; 0: a linear copy
-    episodes: int = option(20, counts("something must be seen"))  # that the policy plays
-    steps: int = option(20_000, counts("a copy is fitted"))  # of Adam
+    rounds: int = option(4, counts("a copy is fitted at least once"))
+    episodes: int = option(8, counts("something must be seen"))  # of a round
+    steps: int = option(5000, counts("a copy is fitted"))  # of Adam in each round
     # On the real task, of an agent that `policy` names.
     agent_steps: int = option(100_000, counts("an agent must train"))
 
@@ -139,11 +147,7 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
 
 
 def copied(
-    config: CopyConfig,
-    task: Task,
-    policy: str,
-    keys: Mapping[str, Array],
-    independent_starts: bool = False,
+    config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]
 ) -> tuple[list[Lesson], pd.DataFrame]:
     """The copy of a policy as the only lesson, and a row of what it cost: `real_steps` and `cpu_s`.
 
@@ -151,30 +155,70 @@ def copied(
       config: form and effort.
       task: the real task.
       policy: as of `policy_of`.
-      keys: `search`, for training an agent; `record`, for all else.
-      independent_starts: as of `sejax.proxies.exact.make_exact`.
+      keys: `search`, for training an agent; `record`, for episodes, errors and fits.
     """
     require_vectors(task)
-    started = time.process_time()
+    started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
-    key_visit, key_starts, key_fit, key_test = jax.random.split(keys["record"], 4)
-    visited, policy_return = visit(task, act, key_visit, config.episodes)
-    noise = np.asarray(jax.random.normal(key_starts, visited.shape))
-    starts = noise + evaluate(gaussian(visited, independent_starts), noise)
-    states = np.concatenate([visited, starts.astype(np.float32)])
-    layers = fit(config, task, states, np.asarray(act(states)), key_fit)
-    tested, copy_return = visit(task, acting(task, layers), key_test, config.episodes)
+    key, key_visit, _, key_fit = jax.random.split(key, 4)
+    own_states, policy_return = visit(task, act, key_visit, config.episodes)
+    scale = own_states.mean(0), np.maximum(own_states.std(0), 1e-2)
+    states, actions = own_states, act(own_states)
+    layers = fit(config, task, states, actions, scale, key_fit)
+    for _ in range(config.rounds - 1):
+        key, key_visit, key_error, key_fit = jax.random.split(key, 4)
+        rough = erring(task, layers, own_states, key_error, config.episodes)
+        visited, _ = visit(task, rough, key_visit, config.episodes)
+        states = np.concatenate([states, visited])
+        actions = np.concatenate([actions, act(visited)])
+        layers = fit(config, task, states, actions, scale, key_fit)
+    tested, copy_return = visit(task, acting(task, layers), key, config.episodes)
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
-    real_steps = len(visited) + len(tested) + (config.agent_steps if is_agent(policy) else 0)
+    real_steps = len(states) + len(tested) + (config.agent_steps if is_agent(policy) else 0)
     costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
-    return [Lesson(0, layers, visited, policy_return)], pd.DataFrame(costs)
+    return [Lesson(0, layers, own_states, policy_return)], pd.DataFrame(costs)
 
 
-def acting(task: Task, layers: Sequence[Layer]) -> Actor:
-    """What a policy of affine maps and ReLUs does: the best action, or its outputs clipped."""
+def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:
+    """What a policy of affine maps and ReLUs does: the best action, or its outputs clipped.
+
+    The `error` is added to its outputs `[state, action_dim]`.
+    """
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        outputs = evaluate(layers, obs) + error(obs)
+        if task.num_actions is not None:
+            return outputs.argmax(axis=1)
+        return outputs.clip(-task.max_action, task.max_action)
+
+    return act
+
+
+def erring(
+    task: Task, layers: Sequence[Layer], states: np.ndarray, key: Array, episodes: int
+) -> Actor:
+    """A policy with a random linear error of the observation, another one in each episode.
+
+    Args:
+      task: the real task.
+      layers: the policy.
+      states: that it visits; an error is linear in observations of their mean 0 and variance 1. Its
+        unit is the action's bound; of discrete actions the deviation of the policy's outputs in
+        these states.
+      key: of the errors.
+      episodes: that are played side by side.
+    """
+    mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
+    unit = task.max_action
     if task.num_actions is not None:
-        return lambda obs: evaluate(layers, obs).argmax(axis=1)
-    return lambda obs: evaluate(layers, obs).clip(-task.max_action, task.max_action)
+        unit = float(evaluate(layers, states).std()) + 1e-9
+    maps = np.asarray(random_map(key, (episodes, task.action_dim, task.obs_dim + 1)))
+
+    def error(obs: np.ndarray) -> np.ndarray:
+        whitened = np.concatenate([(obs - mean) / std, np.ones((len(obs), 1))], axis=1)
+        return np.asarray(_POLICY_ERROR * unit * np.einsum("eij,ej->ei", maps, whitened))
+
+    return acting(task, layers, error)
 
 
 def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray, float]:
@@ -182,34 +226,45 @@ def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray
 
     The actor may be of any library.
     """
-    env, params = task.env, task.params
-    reset = jax.jit(jax.vmap(lambda key: env.reset_env(key, params)))
-    step = jax.jit(jax.vmap(lambda key, state, x: env.step_env(key, state, x, params)[:4]))
+    reset, step = _stepper(task)
     dtype = np.int32 if task.num_actions is not None else np.float32
     key_reset, key_steps = jax.random.split(key)
     obs, state = reset(jax.random.split(key_reset, episodes))
-    active, total, seen = np.ones(episodes, bool), 0.0, []
+    active, returns, seen = np.ones(episodes, bool), np.zeros(episodes), []
     for i in range(task.max_steps):
         seen.append(np.asarray(obs)[active])
         action = np.asarray(act(np.asarray(obs))).astype(dtype)
         keys = jax.random.split(jax.random.fold_in(key_steps, i), episodes)
         obs, state, reward, terminated = step(keys, state, action)
-        total += float(np.asarray(reward)[active].sum())
+        returns += np.where(active, np.asarray(reward, float), 0.0)
         active &= ~np.asarray(terminated)
         if not active.any():
             break
-    return np.concatenate(seen), total / episodes
+    return np.concatenate(seen), float(returns.mean())
+
+
+@functools.cache
+def _stepper(task: Task) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Compiled: resets of many episodes, and a step of each."""
+    env, params = task.env, task.params
+    reset = jax.jit(jax.vmap(lambda key: env.reset_env(key, params)))
+    return reset, jax.jit(jax.vmap(lambda key, state, x: env.step_env(key, state, x, params)[:4]))
 
 
 def fit(
-    config: CopyConfig, task: Task, states: np.ndarray, actions: np.ndarray, key: Array
+    config: CopyConfig,
+    task: Task,
+    states: np.ndarray,
+    actions: np.ndarray,
+    scale: tuple[np.ndarray, np.ndarray],
+    key: Array,
 ) -> list[Layer]:
-    """A copy of what a policy does in some states.
+    """A copy of what a policy does in some states, whose mean and deviation are the `scale`.
 
     Continuous actions by squared error after clipping, discrete ones by cross-entropy.
     """
     is_discrete = task.num_actions is not None
-    mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
+    mean, std = scale
     inputs = jnp.asarray((states - mean) / std, jnp.float32)
     targets = jnp.asarray(actions / task.max_action, jnp.int32 if is_discrete else jnp.float32)
     key_init, key_fit = jax.random.split(key)

@@ -70,7 +70,7 @@ def students(
         )
         returns = counted(table["test_return"])
         mean, worst = returns.mean(), returns.min()
-        print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}")
+        print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}", flush=True)
         tables.append(table)
     return pd.concat(tables, ignore_index=True)
 
@@ -101,6 +101,7 @@ def teach(
     evaluate = make_evaluator(agent, env, env.task, training)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
     se, student = (indices.ravel() for indices in np.indices((len(weights), len(keys))))
+    print(f"training {len(se)} students ...", flush=True)
     spread = spread_over_devices(
         lambda key, one: evaluate(key, env.params(one)),
         devices,
