@@ -51,8 +51,8 @@ class SAC(AgentOptions):
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(64, counts())
     learning_rate: float = option(1e-3, positive("it must learn"), traced=True, varied="triple")
-    tau: float = option(0.005, fraction(), traced=True, help="tau")
-    discount: float = option(0.99, fraction(), traced=True, help="gamma")
+    tau: float = option(0.005, fraction(), traced=True)
+    discount: float = option(0.99, fraction(), traced=True)
 
     def make(self, task: sejax.Task) -> sejax.Agent:
         """The agent for a task's observations and actions."""

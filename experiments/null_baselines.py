@@ -52,27 +52,42 @@ STUDENT_STEPS = {"pendulum": 10_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 
 @dataclass(frozen=True, kw_only=True)
 class NullBaselines(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      env: the task
+      sources: what makes the proxies
+      students: kinds of agents; all that fit the task
+      hparams: Hyperparameters of the students; varied: drawn for each.
+      policies: of each source and kind of teacher
+      num_agents: of each kind on each proxy
+      num_evolved: agents of each kind on the shipped SE
+      steps: of a student; 2,000, more on hard tasks
+      shares: Students with default hyperparameters also train for these shares of the steps.
+      teacher_steps: of a teacher; by the task
+      search_steps: Real steps of a search, at most; those of the shipped SE.
+      num_states: of a table
+      states: States of a table. visited: half of them, half drawn around these; noise: as those in
+        which episodes of the task's SEs begin. Those of `episodes` are visited ones.
+      widen: spread of those around visited states
+    """
+
     name = "null_baselines"
 
-    env: str = setting("cartpole", one_of(tuple(TEACHERS)))  # the task
-    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))  # what makes the proxies
-    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
-    # Hyperparameters of the students; varied: drawn for each.
+    env: str = setting("cartpole", one_of(tuple(TEACHERS)))
+    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))
+    students: tuple[str, ...] = setting(())
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
-    policies: int = count(12, quick=2)  # of each source and kind of teacher
-    num_agents: int = count(5, quick=2)  # of each kind on each proxy
-    num_evolved: int = count(20, quick=2)  # agents of each kind on the shipped SE
-    steps: int | None = count(None, quick=500)  # of a student; 2,000, more on hard tasks
-    # Students with default hyperparameters also train for these shares of the steps.
+    policies: int = count(12, quick=2)
+    num_agents: int = count(5, quick=2)
+    num_evolved: int = count(20, quick=2)
+    steps: int | None = count(None, quick=500)
     shares: tuple[float, ...] = setting((0.125, 0.25, 0.5), quick=(0.5,))
-    teacher_steps: int | None = count(None, quick=500)  # of a teacher; by the task
-    # Real steps of a search, at most; those of the shipped SE.
+    teacher_steps: int | None = count(None, quick=500)
     search_steps: int | None = count(None, quick=5_000)
-    num_states: int = count(1024)  # of a table
-    # States of a table. visited: half of them, half drawn around these; noise: as those in which
-    # episodes of the task's SEs begin. Those of `episodes` are visited ones.
+    num_states: int = count(1024)
     states: str = setting("visited", one_of(("visited", "noise")))
-    widen: float = setting(1.5, positive("it is a scale"))  # spread of those around visited states
+    widen: float = setting(1.5, positive("it is a scale"))
 
     @property
     def task(self) -> envs.Task:

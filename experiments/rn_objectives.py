@@ -38,11 +38,16 @@ DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 
 @dataclass(frozen=True, kw_only=True)
 class RnObjectives(CurveSettings):
+    """Settings of this experiment.
+
+    Attributes:
+      objectives: Of reward_threshold, auc, max_reward, auc_sum.
+      picks: RNs that train agents: best, worst (as the authors' scripts for two objectives).
+    """
+
     name = "rn_objectives"
 
-    # Of reward_threshold, auc, max_reward, auc_sum.
     objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES))
-    # RNs that train agents: best, worst (as the authors' scripts for two objectives).
     picks: tuple[str, ...] = setting(PICKS, each_of(PICKS))
 
     @classmethod

@@ -75,13 +75,23 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreTransforms(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      runs: of each transform, with mirrored sampling and without
+      generations: of a run at most
+      population: candidates of a generation
+      transforms: to compare
+      bins: of step sizes
+    """
+
     name = "score_transforms"
 
-    runs: int = count(220, quick=12)  # of each transform, with mirrored sampling and without
-    generations: int = count(50, quick=10)  # of a run at most
-    population: int = count(16, least=2, quick=8)  # candidates of a generation
-    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS))  # to compare
-    bins: int = count(9, quick=3)  # of step sizes
+    runs: int = count(220, quick=12)
+    generations: int = count(50, quick=10)
+    population: int = count(16, least=2, quick=8)
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS))
+    bins: int = count(9, quick=3)
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:

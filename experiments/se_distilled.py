@@ -32,14 +32,23 @@ QUICK = (
 
 @dataclass(frozen=True, kw_only=True)
 class SeDistilled(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      env: task
+      students: Kinds of students; all that the task's preset has.
+      num_seeds: whole runs of the command
+      num_tested: students of each kind on the SE that is kept
+      run: overrides of the command
+    """
+
     name = "se_distilled"
 
-    env: str = setting("halfcheetah")  # task
-    # Kinds of students; all that the task's preset has.
+    env: str = setting("halfcheetah")
     students: tuple[str, ...] = setting((), each_of(agents.KINDS))
-    num_seeds: int = count(3, quick=2)  # whole runs of the command
-    num_tested: int = count(10, quick=2)  # students of each kind on the SE that is kept
-    run: tuple[str, ...] = setting(())  # overrides of the command
+    num_seeds: int = count(3, quick=2)
+    num_tested: int = count(10, quick=2)
+    run: tuple[str, ...] = setting(())
 
     def words(self, seed: int) -> list[str]:
         """The command's overrides for a seed."""

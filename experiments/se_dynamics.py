@@ -45,16 +45,28 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SeDynamics(RunSettings):
+    """Settings of this experiment.
+
+    Attributes:
+      generations: outer iterations
+      kinds: of SEs
+      runs: NES runs of each kind
+      max_steps: of an agent, but on bandits
+      students: kinds of agents; all that fit
+      num_agents: of each kind and discount on each SE
+      test_episodes: of each agent
+    """
+
     name = "se_dynamics"
     quick_run = runs.QUICK
 
-    generations: int | None = count(40, quick=3)  # outer iterations
-    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
-    runs: int = count(10, quick=2)  # NES runs of each kind
-    max_steps: int = count(4000, quick=1000)  # of an agent, but on bandits
-    students: tuple[str, ...] = setting((), each_of(agents.KINDS))  # kinds of agents; all that fit
-    num_agents: int = count(10, quick=5)  # of each kind and discount on each SE
-    test_episodes: int = count(10)  # of each agent
+    generations: int | None = count(40, quick=3)
+    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))
+    runs: int = count(10, quick=2)
+    max_steps: int = count(4000, quick=1000)
+    students: tuple[str, ...] = setting((), each_of(agents.KINDS))
+    num_agents: int = count(10, quick=5)
+    test_episodes: int = count(10)
 
     def agent_of(self, student: str) -> Any:
         """The configuration of a kind of students."""

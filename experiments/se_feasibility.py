@@ -36,12 +36,20 @@ PAPER = {
 
 @dataclass(frozen=True, kw_only=True)
 class SeFeasibility(RunSettings):
+    """Settings of this experiment.
+
+    Attributes:
+      generations: outer iterations; the preset's
+      runs: independent NES runs
+      agent_hparams: varied: drawn for each agent
+    """
+
     name = "se_feasibility"
     quick_run = runs.QUICK
 
-    generations: int | None = count(None, quick=8)  # outer iterations; the preset's
-    runs: int = count(10, quick=3)  # independent NES runs
-    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))  # varied: drawn for each agent
+    generations: int | None = count(None, quick=8)
+    runs: int = count(10, quick=3)
+    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:

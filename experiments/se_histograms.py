@@ -77,14 +77,25 @@ PAPER_RETURNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class SeHistograms(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      proxy: SE: a run directory, a file or a shipped name
+      agents: kinds of agents, a row each
+      num_agents: of each kind
+      test_episodes: of each agent
+      max_steps: of training; as the SE's configuration says
+      max_rows: transitions of training, the last ones of an agent
+    """
+
     name = "se_histograms"
 
-    proxy: str = setting(SOFT_SE)  # SE: a run directory, a file or a shipped name
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents, a row each
-    num_agents: int = count(10, quick=3)  # of each kind
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=1500)  # of training; as the SE's configuration says
-    max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
+    proxy: str = setting(SOFT_SE)
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))
+    num_agents: int = count(10, quick=3)
+    test_episodes: int = count(10)
+    max_steps: int | None = count(None, quick=1500)
+    max_rows: int = count(10_000)
 
 
 def compute(settings: SeHistograms) -> pd.DataFrame:

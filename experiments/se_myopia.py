@@ -47,15 +47,25 @@ MARGIN = 0.1  # difference that counts as none, as a share of the way from untra
 
 @dataclass(frozen=True, kw_only=True)
 class SeMyopia(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      env: task of the SEs
+      ses: Files of SEs, run directories or shipped names; all that are shipped and in results/.
+      num_ses: the first SEs of each set
+      num_agents: on each SE with each discount
+      test_episodes: of each agent
+      max_steps: of training; as the SE's configuration says
+    """
+
     name = "se_myopia"
 
-    env: str = setting("cartpole")  # task of the SEs
-    # Files of SEs, run directories or shipped names; all that are shipped and in results/.
+    env: str = setting("cartpole")
     ses: tuple[str, ...] = setting((), quick=("cartpole", agents.SOFT_SE))
-    num_ses: int = count(5, quick=1)  # the first SEs of each set
-    num_agents: int = count(20, quick=5)  # on each SE with each discount
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=1000)  # of training; as the SE's configuration says
+    num_ses: int = count(5, quick=1)
+    num_agents: int = count(20, quick=5)
+    test_episodes: int = count(10)
+    max_steps: int | None = count(None, quick=1000)
 
 
 class Se(NamedTuple):

@@ -67,18 +67,30 @@ PAPER_RETURNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class SePerformance(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      agents: kinds of agents
+      num_agents: for each SE
+      num_ses: SEs of a set at most
+      test_episodes: of each agent
+      max_steps: of training; as the SEs' configuration says
+      varied: file of SEs learned with drawn hyperparameters
+      fixed: file of SEs learned with one agent's
+      real_groups: Groups of agents on the real task, which is slow; as many as SEs.
+      real_episodes: On the real task; 1000 (discrete TD3 in Acrobot 500).
+    """
+
     name = "se_performance"
 
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
-    num_agents: int = count(10, quick=4)  # for each SE
-    num_ses: int = count(40, quick=3)  # SEs of a set at most
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
-    varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
-    fixed: str | None = setting(None, quick="cartpole")  # file of SEs learned with one agent's
-    # Groups of agents on the real task, which is slow; as many as SEs.
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))
+    num_agents: int = count(10, quick=4)
+    num_ses: int = count(40, quick=3)
+    test_episodes: int = count(10)
+    max_steps: int | None = count(None, quick=4000)
+    varied: str | None = setting(None)
+    fixed: str | None = setting(None, quick="cartpole")
     real_groups: int | None = count(None)
-    # On the real task; 1000 (discrete TD3 in Acrobot 500).
     real_episodes: int | None = count(None, quick=100)
 
 

@@ -50,10 +50,17 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 
 @dataclass(frozen=True, kw_only=True)
 class Timings(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      rows: tasks and proxies
+      generations: outer iterations to time
+    """
+
     name = "timings"
 
-    rows: tuple[str, ...] = setting(tuple(PAPER), each_of(PAPER))  # tasks and proxies
-    generations: int = count(2)  # outer iterations to time
+    rows: tuple[str, ...] = setting(tuple(PAPER), each_of(PAPER))
+    generations: int = count(2)
 
 
 def compute(settings: Timings) -> pd.DataFrame:

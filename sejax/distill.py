@@ -49,23 +49,29 @@ CHOOSE, TEST = "choose", "test"  # what students are for
 
 @dataclass(frozen=True, kw_only=True)
 class DistillConfig(Options):
-    """The fields of `python -m sejax.distill`; all others are those of `sejax.run`."""
+    """The fields of `python -m sejax.distill`; all others are those of `sejax.run`.
+
+    Attributes:
+      policy: ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax,
+        such as ppo. null: a linear policy is searched.
+      copy: of a given policy
+      search: of a linear policy
+      independent_starts: Whether the numbers of an initial state are independent; else they have
+        the visited states' covariance.
+      num_snapshots: Policies that are taught: the best tested one of each of so many equal parts of
+        the search.
+      num_students: Students of each agent on the SE of each policy, which choose one of the SEs.
+      num_tested: Others of each agent, on the chosen SE.
+    """
 
     group: ClassVar[str] = ""
 
-    # ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax, such as
-    # ppo. null: a linear policy is searched.
     policy: str | None = None
-    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)  # of a given policy
-    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)  # of a linear policy
-    # Whether the numbers of an initial state are independent; else they have the visited states'
-    # covariance.
+    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
+    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     independent_starts: bool = False
-    # Policies that are taught: the best tested one of each of so many equal parts of the search.
     num_snapshots: int = option(6, counts("something must be taught"))
-    # Students of each agent on the SE of each policy, which choose one of the SEs.
     num_students: int = option(4, counts("an SE is chosen by what it teaches"))
-    # Others of each agent, on the chosen SE.
     num_tested: int = option(10, counts("a card says what an SE teaches"))
 
     def __post_init__(self) -> None:

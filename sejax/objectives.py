@@ -106,25 +106,20 @@ class MaxReward(ObjectiveConfig):
     Short ones (a Pendulum is rewarded for where it goes at once) or long ones (a car that reaches
     the hill at all) tell proxies apart that a whole episode of the task's does not.
 
+    Attributes:
+      first_eval_steps: Steps of a test episode that are scored in the first generation; null: the
+        task's limit.
+      curriculum_generations: Generation from which on the task's limit counts; before, the steps
+        change linearly.
+
     Source: paper, Algorithm 1, EvaluateAgent; the curriculum: Liesen et al., "Discovering Minimal
     Reinforcement Learning Environments" (2024).
     """
 
     scores_are_returns: ClassVar[bool] = True
 
-    first_eval_steps: int | None = option(
-        None,
-        counts("there is nothing to score otherwise"),
-        help=(
-            "Steps of a test episode that are scored in the first generation; null: the task's "
-            "limit."
-        ),
-    )
-    curriculum_generations: int = option(
-        50,
-        counts("it is the length of a curriculum"),
-        help="Generation from which on the task's limit counts; before, the steps change linearly.",
-    )
+    first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
+    curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
 
     def make(self, task: Task) -> Objective:
         objective = Objective(
@@ -155,14 +150,13 @@ class RewardThreshold(ObjectiveConfig):
 
     .. math:: -(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))
 
+    Attributes:
+      unsolved_weight: w_sol: training steps that a unit of missing return is worth
+
     Source: paper, section "Learning Reward Networks".
     """
 
-    unsolved_weight: float = option(
-        100.0,
-        not_negative("a shortfall must not be rewarded"),
-        help="w_sol: training steps that a unit of missing return is worth",
-    )
+    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
 
     def make(self, task: Task) -> Objective:
         """The objective on a task that says when it is solved.

@@ -55,43 +55,33 @@ class TrainingConfig(Options):
     """How long an agent trains, and how it is tested.
 
     The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`.
+
+    Attributes:
+      max_episodes: n_e: of a training at most
+      min_steps: The stop rule waits for so many training steps.
+      max_steps: Training ends after so many steps, whatever the rule says.
+      stop_rule: plateau (SEs), solved (real tasks)
+      window: d: episodes in each of the two means that the plateau rule compares
+      plateau_tolerance: C_diff: relative change between them that counts as flat
+      solved_by: Whose last d returns must reach the solved reward.
+      test_episodes: n_te: greedy episodes on the real task after training
+      tests_between: Greedy episodes on the real task after each training episode; the solved rule
+        by tests has at least one.
+      time_limit_is_terminal: a real episode cut by the limit does not bootstrap
     """
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(
-        2000, counts("it counts episodes"), help="n_e: of a training at most"
-    )
-    min_steps: int = option(
-        0, counts("it counts steps", least=0), help="The stop rule waits for so many steps."
-    )
-    max_steps: int | None = option(
-        2000, counts("an agent must train"), help="The most steps, whatever the rule says."
-    )
-    stop_rule: str = option("never", one_of(STOP_RULES), help="plateau (SEs), solved (real tasks)")
-    window: int = option(
-        10, counts("it counts episodes"), help="d: episodes of each mean that plateau compares"
-    )
-    plateau_tolerance: float = option(
-        0.01, not_negative("it bounds a relative change"), help="C_diff: change that counts as flat"
-    )
-    solved_by: str = option(
-        "test", one_of(SOLVED_BY), help="Whose last d returns must reach the solved reward."
-    )
-    test_episodes: int = option(
-        10, counts("it counts episodes"), help="n_te: greedy episodes on the real task at its end"
-    )
-    tests_between: int = option(
-        0,
-        counts("it counts episodes", least=0),
-        help=(
-            "Greedy episodes on the real task after each training episode; the solved rule by "
-            "tests has at least one."
-        ),
-    )
-    time_limit_is_terminal: bool = option(
-        True, help="a real episode cut by the limit does not bootstrap"
-    )
+    max_episodes: int = option(2000, counts("it counts episodes"))
+    min_steps: int = option(0, counts("it counts steps", least=0))
+    max_steps: int | None = option(2000, counts("an agent must train"))
+    stop_rule: str = option("never", one_of(STOP_RULES))
+    window: int = option(10, counts("it counts episodes"))
+    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
+    solved_by: str = option("test", one_of(SOLVED_BY))
+    test_episodes: int = option(10, counts("it counts episodes"))
+    tests_between: int = option(0, counts("it counts episodes", least=0))
+    time_limit_is_terminal: bool = True
 
     @property
     def is_fixed_length(self) -> bool:

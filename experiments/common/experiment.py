@@ -29,7 +29,7 @@ NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result dep
 
 
 def setting(default: Any, rule: Rule | None = None, *, quick: Any = None) -> Any:
-    """A field of `Settings`. The comment beside it is its help text.
+    """A field of `Settings`, whose docstring has its help text.
 
     Args:
       default: its default; None where it may be left open.
@@ -51,18 +51,24 @@ class Settings(options.Options):
 
     The folder of the results holds what is kept: table, figures, learned proxies and rows. The
     folder `work` holds what a stopped experiment goes on from, and may be deleted.
+
+    Attributes:
+      quick: a small version, in minutes
+      from_rows: make table and figures again from the stored rows
+      out: Folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick.
+      work: Folder of what is not kept; runs/experiments/... for results/..., or out/work.
+      seed: first seed
+      devices: to use; all
     """
 
     name: ClassVar[str]  # of the experiment's module
 
-    quick: bool = setting(False)  # a small version, in minutes
-    from_rows: bool = setting(False)  # make table and figures again from the stored rows
-    # Folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick.
+    quick: bool = setting(False)
+    from_rows: bool = setting(False)
     out: str | None = setting(None)
-    # Folder of what is not kept; runs/experiments/... for results/..., or out/work.
     work: str | None = setting(None)
-    seed: int = setting(0, options.seed())  # first seed
-    devices: int | None = count(None)  # to use; all
+    seed: int = setting(0, options.seed())
+    devices: int | None = count(None)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -37,19 +37,28 @@ GRID_POINTS = 60
 
 @dataclass(frozen=True, kw_only=True)
 class BreakEven(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      proxies: Proxies that ship with sejax.
+      num_agents: Agents of each sort, in five groups; 100, on HalfCheetah 20.
+      num_pilots: Of each kind that may be the fastest, and of learning curves; 20, on HalfCheetah
+        5.
+      max_steps: of an agent with real steps; by the task
+      test_episodes: of each agent
+      seed: first seed; pilots have the one 500 before
+    """
+
     name = "break_even"
 
-    # Proxies that ship with sejax.
     proxies: tuple[str, ...] = setting(
         tuple(pretrained_names()), each_of(pretrained_names()), quick=("cliff_walking-rn",)
     )
-    # Agents of each sort, in five groups; 100, on HalfCheetah 20.
     num_agents: int | None = count(None, NUM_GROUPS, quick=10)
-    # Of each kind that may be the fastest, and of learning curves; 20, on HalfCheetah 5.
     num_pilots: int | None = count(None, quick=2)
-    max_steps: int | None = count(None, quick=3000)  # of an agent with real steps; by the task
-    test_episodes: int = count(10)  # of each agent
-    seed: int = setting(1000, options.seed())  # first seed; pilots have the one 500 before
+    max_steps: int | None = count(None, quick=3000)
+    test_episodes: int = count(10)
+    seed: int = setting(1000, options.seed())
 
     def counts(self, task: Task) -> tuple[int, int]:
         """How many agents of each sort, and how many pilots."""

@@ -152,17 +152,23 @@ def label(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class RnSettings(RunSettings):
-    """Settings about the task and the RNs that are learned; defaults are those of the study."""
+    """Settings about the task and the RNs that are learned; defaults are those of the study.
+
+    Attributes:
+      env: Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
+      variants: Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.
+      learned: RNs to learn of each variant
+      generations: outer iterations; the preset's
+      rns_dir: of RNs; results/reward_networks, quick: rns/ in `out`
+    """
 
     quick_run = ("es.population_size=8",)
 
-    # Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
     env: str = setting("cliff_walking", one_of(STUDIES))
-    # Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.
     variants: tuple[str, ...] = setting(VARIANTS)
-    learned: int = count(10, quick=2)  # RNs to learn of each variant
-    generations: int | None = count(None, quick=4)  # outer iterations; the preset's
-    rns_dir: str | None = setting(None)  # of RNs; results/reward_networks, quick: rns/ in `out`
+    learned: int = count(10, quick=2)
+    generations: int | None = count(None, quick=4)
+    rns_dir: str | None = setting(None)
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:

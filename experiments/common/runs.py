@@ -39,14 +39,21 @@ QUICK = (
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(Settings):
-    """Settings about the NES runs."""
+    """Settings about the NES runs.
+
+    Attributes:
+      env: task: cartpole, acrobot, ...
+      generations: outer iterations; the preset's
+      preset: of the NES runs: best, paper, for SEs paper_performance
+      run: overrides of the NES runs, or as below
+    """
 
     quick_run: ClassVar[tuple[str, ...]] = ()  # overrides of the NES runs with quick=true
 
-    env: str = setting("cartpole")  # task: cartpole, acrobot, ...
-    generations: int | None = count(None)  # outer iterations; the preset's
-    preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
-    run: tuple[str, ...] = setting(())  # overrides of the NES runs, or as below
+    env: str = setting("cartpole")
+    generations: int | None = count(None)
+    preset: str = setting("best")
+    run: tuple[str, ...] = setting(())
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""

@@ -211,14 +211,16 @@ class AgentConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentOptions(AgentConfig):
-    """What the configurations of sejax's learning agents share."""
+    """What the configurations of sejax's learning agents share.
+
+    Attributes:
+      warmup_episodes: Episodes before learning starts and before a stop rule may judge.
+    """
 
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    warmup_episodes: int = option(
-        1, counts("it counts episodes", least=0), help="Episodes before it learns or stops."
-    )
+    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         return self.warmup_episodes * max_episode_steps
@@ -230,10 +232,15 @@ class AgentOptions(AgentConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class TorsoOptions(AgentOptions):
-    """What agents share that can see images."""
+    """What agents share that can see images.
 
-    torso: str | None = option(None, one_of(("conv",)), help="what comes before the hidden layers")
-    num_filters: int = option(16, counts(), help="of torso=conv, each of 3 x 3 pixels")
+    Attributes:
+      torso: what comes before the hidden layers
+      num_filters: of torso=conv, each of 3 x 3 pixels
+    """
+
+    torso: str | None = option(None, one_of(("conv",)))
+    num_filters: int = option(16, counts())
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -31,31 +31,29 @@ LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 @dataclass(frozen=True, kw_only=True)
 class DDQNConfig(OffPolicyOptions, TorsoOptions):
-    """DDQN's hyperparameters."""
+    """DDQN's hyperparameters.
 
-    epsilon_init: float = option(1.0, fraction(), traced=True, help="share of random actions")
+    Attributes:
+      epsilon_init: share of random actions
+      epsilon_decay: factor for each episode
+      exploration_steps: If given, epsilon falls linearly in so many steps from when the agent first
+        learns, whatever the episodes: for environments whose episodes have one or two steps.
+      double: the online network chooses a target's action; else the target network
+      loss: of the error; huber: its gradient is clipped
+      target_update_every: learning steps for each update of the target
+      train_every: agent steps for each time that it learns, ...
+      gradient_steps: ... in so many learning steps
+    """
+
+    epsilon_init: float = option(1.0, fraction(), traced=True)
     epsilon_min: float = option(0.01, fraction(), traced=True)
-    epsilon_decay: float = option(0.9, fraction(), traced=True, help="factor for each episode")
-    exploration_steps: int | None = option(
-        1000,
-        counts("it counts steps"),
-        traced=True,
-        help=(
-            "If given, epsilon falls linearly in so many steps from when the agent first learns, "
-            "whatever the episodes: for environments whose episodes have one or two steps."
-        ),
-    )
-    double: bool = option(
-        True, help="the online network chooses a target's action; else the target network"
-    )
-    loss: str = option(
-        "squared", one_of(LOSSES), help="of the error; huber: its gradient is clipped"
-    )
-    target_update_every: int = option(
-        1, counts(), help="learning steps for each update of the target"
-    )
-    train_every: int = option(1, counts(), help="agent steps for each time that it learns, ...")
-    gradient_steps: int = option(1, counts(), help="... in so many learning steps")
+    epsilon_decay: float = option(0.9, fraction(), traced=True)
+    exploration_steps: int | None = option(1000, counts("it counts steps"), traced=True)
+    double: bool = True
+    loss: str = option("squared", one_of(LOSSES))
+    target_update_every: int = option(1, counts())
+    train_every: int = option(1, counts())
+    gradient_steps: int = option(1, counts())
 
     @property
     def learns_each_step(self) -> bool:
@@ -83,16 +81,17 @@ class DDQNConfig(OffPolicyOptions, TorsoOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class DuelingDDQNConfig(DDQNConfig):
-    """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
+    """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN).
+
+    Attributes:
+      feature_dim: outputs of the part that both streams share
+      stream_num_layers: Hidden layers of the value and of the advantage stream.
+    """
 
     cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
-    feature_dim: int = option(64, counts(), help="outputs of the part that both streams share")
-    stream_num_layers: int = option(
-        1,
-        counts("it counts layers", 0, MOST_LAYERS),
-        help="Hidden layers of the value and of the advantage stream.",
-    )
+    feature_dim: int = option(64, counts())
+    stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
     stream_hidden_size: int = option(32, counts())
 
     def network(self, num_actions: int) -> nn.Module:

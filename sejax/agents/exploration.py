@@ -62,21 +62,18 @@ class ICMConfig(ExplorationConfig):
 
     The defaults are the paper's values optimized for CartPole, as in the authors' scripts. Its text
     says that all experiments have its defaults: 1e-4, 0.2, 0.5 and 64 features.
+
+    Attributes:
+      forward_weight: beta: the forward model's share of the loss
+      reward_scale: eta: intrinsic reward for each unit of prediction error
     """
 
     states: ClassVar[str | None] = "vector"
     needs_each_step: ClassVar[bool] = True  # its module learns once at each step
 
     learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
-    forward_weight: float = option(
-        0.05, fraction(), traced=True, help="beta: the forward model's share of the loss"
-    )
-    reward_scale: float = option(
-        0.03,
-        not_negative("it scales a bonus"),
-        traced=True,
-        help="eta: intrinsic reward for each unit of prediction error",
-    )
+    forward_weight: float = option(0.05, fraction(), traced=True)
+    reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
     feature_dim: int = option(32, counts("the models need units"))
     hidden_size: int = option(128, counts("the models need units"))
     num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
@@ -351,14 +348,17 @@ def _is_index(action: Array) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class CountBasedConfig(ExplorationConfig):
-    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions."""
+    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions.
+
+    Attributes:
+      reward_scale: beta
+      count_power: p: 1 in the paper's text, 0.5 in the authors' code
+    """
 
     states: ClassVar[str | None] = "discrete"
 
-    reward_scale: float = option(0.1, not_negative("it scales a bonus"), help="beta")
-    count_power: float = option(
-        1.0, positive("the bonus would not fade"), help="p: 1 in the paper, 0.5 in its code"
-    )
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"))
+    count_power: float = option(1.0, positive("the bonus would not fade"))
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""

@@ -24,27 +24,20 @@ COMPARED_BY = ("advantage", "rank")
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureConfig(Options):
-    """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line."""
+    """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line.
+
+    Attributes:
+      aggregate: The incumbent's score, given its mean with each agent: the mean of those, or the
+        worst.
+      compared_by: How scores of several agents become comparable. advantage: a candidate's score
+        less the incumbent's mean with the same agent; rank: its rank among that agent's candidates,
+        less the incumbent's.
+    """
 
     group: ClassVar[str] = "agents"
 
-    aggregate: str = option(
-        "mean",
-        one_of(("mean", "min")),
-        help=(
-            "The incumbent's score, given its mean with each agent: the mean of those, or the "
-            "worst."
-        ),
-    )
-    compared_by: str = option(
-        "advantage",
-        one_of(COMPARED_BY),
-        help=(
-            "How scores of several agents become comparable. advantage: a candidate's score less "
-            "the incumbent's mean with the same agent; rank: its rank among that agent's "
-            "candidates, less the incumbent's."
-        ),
-    )
+    aggregate: str = option("mean", one_of(("mean", "min")))
+    compared_by: str = option("advantage", one_of(COMPARED_BY))
 
 
 @dataclass(frozen=True, kw_only=True)

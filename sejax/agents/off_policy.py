@@ -37,20 +37,24 @@ class OffPolicyOptions(AgentOptions):
 
     The defaults are small agents, quick to learn within 2,000 steps (`docs/agents.md`);
     `preset=paper` has the paper's.
+
+    Attributes:
+      batch_size: transitions
+      buffer_size: steps
+      hidden_size: units of each hidden layer
+      learning_rate: of Adam
+      tau: Weight of the online network in the target's update.
+      discount: gamma
     """
 
-    batch_size: int = option(64, counts(), varied="triple", help="transitions")
-    buffer_size: int = option(100_000, counts(), help="steps")
-    hidden_size: int = option(64, counts(), varied="triple", help="units of each hidden layer")
+    batch_size: int = option(64, counts(), varied="triple")
+    buffer_size: int = option(100_000, counts())
+    hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(1, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
-    learning_rate: float = option(
-        1e-3, positive(MOVES), traced=True, varied="triple", help="of Adam"
-    )
-    tau: float = option(
-        0.01, fraction(), traced=True, help="Weight of the online network in the target's update."
-    )
-    discount: float = option(0.99, fraction(), traced=True, help="gamma")
+    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")
+    tau: float = option(0.01, fraction(), traced=True)
+    discount: float = option(0.99, fraction(), traced=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,12 +78,17 @@ class OffPolicyOptions(AgentOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ActorCriticOptions(OffPolicyOptions):
-    """Hyperparameters that TD3 and SAC share. Actions are uniformly random in the warm-up."""
+    """Hyperparameters that TD3 and SAC share. Actions are uniformly random in the warm-up.
+
+    Attributes:
+      learning_rate: of the actor, the critics and the temperature
+      action_repeat: environment steps for each decision
+    """
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    learning_rate: float = option(3e-3, help="of the actor, the critics and the temperature")
-    action_repeat: int = option(1, counts(), help="environment steps for each decision")
+    learning_rate: float = 3e-3
+    action_repeat: int = option(1, counts())
 
     def spec(self) -> AgentSpec:
         return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)

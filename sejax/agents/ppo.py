@@ -58,6 +58,16 @@ class PPOConfig(TorsoOptions):
     """PPO (clip) for discrete and continuous actions.
 
     The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
+
+    Attributes:
+      rollout_steps: Decisions between two learning phases; null: as `update_episodes` says.
+      update_episodes: of full length, between two learning phases
+      epochs: passes over the rollout in a learning phase
+      num_minibatches: Adam steps in an epoch, each on its part of it
+      gae_lambda: of advantages=gae
+      normalize_rewards: Divides rewards by the running std of returns, with advantages=gae.
+      max_grad_norm: Norm that a longer gradient is scaled down to.
+      init_action_std: Of the Gaussian policy; learned.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -67,27 +77,19 @@ class PPOConfig(TorsoOptions):
     activation: str = option("tanh", one_of(ACTIVATIONS))
     learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
-    rollout_steps: int | None = option(
-        128, counts(), help="Decisions between learning phases; null: as `update_episodes` says."
-    )
-    update_episodes: int = option(10, counts(), help="of full length, between two learning phases")
-    epochs: int = option(10, counts(), help="passes over the rollout in a learning phase")
-    num_minibatches: int = option(
-        4, counts(), help="Adam steps in an epoch, each on its part of it"
-    )
+    rollout_steps: int | None = option(128, counts())
+    update_episodes: int = option(10, counts())
+    epochs: int = option(10, counts())
+    num_minibatches: int = option(4, counts())
     advantages: str = option("gae", one_of(ADVANTAGES))
-    gae_lambda: float = option(0.9, fraction(), traced=True, help="of advantages=gae")
+    gae_lambda: float = option(0.9, fraction(), traced=True)
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
-    normalize_rewards: bool = option(
-        True, help="Divides rewards by the running std of returns, with advantages=gae."
-    )
-    max_grad_norm: float | None = option(
-        0.5, positive(MOVES), help="Norm that a longer gradient is scaled down to."
-    )
+    normalize_rewards: bool = True
+    max_grad_norm: float | None = option(0.5, positive(MOVES))
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
-    init_action_std: float = option(0.5, positive(MOVES), help="Of the Gaussian policy; learned.")
+    init_action_std: float = option(0.5, positive(MOVES))
     action_repeat: int = option(1, counts())
 
     @classmethod

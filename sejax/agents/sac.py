@@ -35,6 +35,14 @@ _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' c
 class SACConfig(ActorCriticOptions):
     """SAC's hyperparameters.
 
+    Attributes:
+      alpha: Temperature: what a nat of entropy is worth, in reward units. None: learned, as the
+        authors do to meet a target entropy.
+      target_entropy: Of actions in [-1, 1], in nats for each dimension; a uniform one's is the
+        largest, log 2.
+      target_entropy_fraction: Of discrete actions, as a fraction of the largest, log |A|: see
+        docs/agents.md.
+
     Differs: Haarnoja et al. (2018) have two layers of 256 units, batches of 256 out of a million
     steps, a learning rate of 0.0003 and a tau of 0.005 (table 1). Christodoulou (2019)
     has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
@@ -42,31 +50,10 @@ class SACConfig(ActorCriticOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    alpha: float | None = option(
-        None,
-        not_negative("it weighs the entropy"),
-        traced=True,
-        help=(
-            "Temperature: what a nat of entropy is worth, in reward units. None: learned, as the "
-            "authors do to meet a target entropy."
-        ),
-    )
+    alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
     init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
-    target_entropy: float = option(
-        -1.0,
-        finite("the temperature must settle"),
-        traced=True,
-        help=(
-            "Of actions in [-1, 1], in nats for each dimension; a uniform one's is the largest, "
-            "log 2."
-        ),
-    )
-    target_entropy_fraction: float = option(
-        0.2,
-        fraction(),
-        traced=True,
-        help="Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.",
-    )
+    target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
+    target_entropy_fraction: float = option(0.2, fraction(), traced=True)
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions.

@@ -33,22 +33,22 @@ _MIN_TEMPERATURE = 1e-6
 class TD3Config(ActorCriticOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
+    Attributes:
+      policy_delay: learning steps for each one of actor and targets
+      action_noise_std: Exploration, in units of the largest action.
+      target_noise_std: Smoothing of the target policy, likewise.
+      noisy_tests: exploration noise in tests too, as in the authors' code
+
     Differs: the authors do not scale the target policy's noise by the largest action. That is the
     same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
     unless `noisy_tests` is set.
     """
 
-    policy_delay: int = option(2, counts(), help="learning steps for each one of actor and targets")
-    action_noise_std: float = option(
-        0.1, not_negative(), traced=True, help="Exploration, in units of the largest action."
-    )
-    target_noise_std: float = option(
-        0.2, not_negative(), traced=True, help="Smoothing of the target policy, likewise."
-    )
+    policy_delay: int = option(2, counts())
+    action_noise_std: float = option(0.1, not_negative(), traced=True)
+    target_noise_std: float = option(0.2, not_negative(), traced=True)
     target_noise_clip: float = option(0.5, not_negative(), traced=True)
-    noisy_tests: bool = option(
-        False, help="exploration noise in tests too, as in the authors' code"
-    )
+    noisy_tests: bool = False
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
@@ -62,6 +62,13 @@ class DiscreteTD3Config(TD3Config):
     The buffer keeps actions as vectors `[num_actions]`: samples of the Gumbel-Softmax with
     exploration noise. The environment takes the index of the largest entry.
 
+    Attributes:
+      layer_norm: after each hidden layer but the first, as in the authors' code
+      temperature: Of the Gumbel-Softmax at the start.
+      final_temperature: as a fraction of it, ...
+      temperature_steps: ... reached linearly after so many updates
+      one_hot_actions: straight-through one-hot actions in place of soft ones
+
     Differs: the temperature reaches its end after `temperature_steps` learning steps, in the
     authors' code after one less. Tests take the likeliest action unless `noisy_tests` is set.
     """
@@ -70,21 +77,11 @@ class DiscreteTD3Config(TD3Config):
 
     activation: str = "tanh"
     learning_rate: float = 1e-3
-    layer_norm: bool = option(
-        True, help="after each hidden layer but the first, as in the authors' code"
-    )
-    temperature: float = option(
-        1.0, positive(MOVES), traced=True, help="Of the Gumbel-Softmax at the start."
-    )
-    final_temperature: float = option(
-        0.05, fraction(), traced=True, help="as a fraction of it, ..."
-    )
-    temperature_steps: int = option(
-        2000, counts(), help="... reached linearly after so many updates"
-    )
-    one_hot_actions: bool = option(
-        False, help="straight-through one-hot actions in place of soft ones"
-    )
+    layer_norm: bool = True
+    temperature: float = option(1.0, positive(MOVES), traced=True)
+    final_temperature: float = option(0.05, fraction(), traced=True)
+    temperature_steps: int = option(2000, counts())
+    one_hot_actions: bool = False
 
     def make(self, task: Task) -> Agent:
         assert task.num_actions is not None

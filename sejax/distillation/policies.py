@@ -40,15 +40,21 @@ _OVERSHOOT = 0.05  # weight of what lies beyond the bounds, where clipping has n
 
 @dataclass(frozen=True, kw_only=True)
 class CopyConfig(Options):
-    """How a policy is copied."""
+    """How a policy is copied.
+
+    Attributes:
+      hidden_size: ReLUs; 0: a linear copy
+      episodes: of a round
+      steps: of Adam in each round
+      agent_steps: On the real task, of an agent that `policy` names.
+    """
 
     group: ClassVar[str] = "copy"
 
-    hidden_size: int = option(32, counts("0 is a linear copy", least=0))  # ReLUs; 0: a linear copy
+    hidden_size: int = option(32, counts("0 is a linear copy", least=0))
     rounds: int = option(4, counts("a copy is fitted at least once"))
-    episodes: int = option(8, counts("something must be seen"))  # of a round
-    steps: int = option(5000, counts("a copy is fitted"))  # of Adam in each round
-    # On the real task, of an agent that `policy` names.
+    episodes: int = option(8, counts("something must be seen"))
+    steps: int = option(5000, counts("a copy is fitted"))
     agent_steps: int = option(100_000, counts("an agent must train"))
 
 

@@ -42,31 +42,39 @@ COLUMNS = ("start", "generation", "test_mean", "test_std", "real_steps", "cpu_s"
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig(Options):
     """How a linear policy is searched. Weights are those of observations with mean 0, variance 1,
-    and of actions in units of the task's bound."""
+    and of actions in units of the task's bound.
+
+    Attributes:
+      num_starts: Searches that begin, each for so many generations (up to a test); the one whose
+        policy was tested best goes on. A search may stop at a poor gait, which shows early.
+      num_directions: N, two episodes each
+      num_top: b: directions that count
+      noise_std: nu
+      step_size: alpha
+      constant: Share of the generations after which the step size declines, to a tenth at the end.
+      policy_error: Root mean square of the error of an episode's policy, in units of the action's
+        bound; of discrete actions in units of the policy's own outputs.
+      alive_bonus: Subtracted from each step's reward while searching; unless given, the task's
+        reward for being healthy.
+      short_steps: The first generations have shorter episodes.
+      num_tests: episodes without the error
+    """
 
     group: ClassVar[str] = "search"
 
     generations: int = option(100, counts("something must be searched"))
-    # Searches that begin, each for so many generations (up to a test); the one whose policy was
-    # tested best goes on. A search may stop at a poor gait, which shows early.
     num_starts: int = option(3, counts("a search begins"))
     start_generations: int = option(40, counts("a start must be tried"))
-    num_directions: int = option(32, counts("something must be tried"))  # N, two episodes each
-    num_top: int = option(16, counts("something must be learned from"))  # b: directions that count
-    noise_std: float = option(0.03, positive("directions must differ"))  # nu
-    step_size: float = option(0.02, positive("the policy would not move"))  # alpha
-    # Share of the generations after which the step size declines, to a tenth at the end.
+    num_directions: int = option(32, counts("something must be tried"))
+    num_top: int = option(16, counts("something must be learned from"))
+    noise_std: float = option(0.03, positive("directions must differ"))
+    step_size: float = option(0.02, positive("the policy would not move"))
     constant: float = option(0.5, not_negative("it is a share of the generations"))
-    # Root mean square of the error of an episode's policy, in units of the action's bound; of
-    # discrete actions in units of the policy's own outputs.
     policy_error: float = option(0.1, not_negative("it is a size"))
-    # Subtracted from each step's reward while searching; unless given, the task's reward for being
-    # healthy.
     alive_bonus: float = option(0.0, finite("it is a reward"))
-    # The first generations have shorter episodes.
     short_steps: int | None = option(None, counts("an episode has steps"))
     short_generations: int = option(0, counts("it counts generations", least=0))
-    num_tests: int = option(5, counts("a policy must be tested"))  # episodes without the error
+    num_tests: int = option(5, counts("a policy must be tested"))
     test_every: int = option(10, counts("it counts generations"))
 
     def __post_init__(self) -> None:

@@ -133,6 +133,9 @@ def _next_indices(cells: np.ndarray) -> np.ndarray:
 class CliffWalking(Options):
     """Each step costs 1, and stepping off the cliff 100 and the episode.
 
+    Attributes:
+      goal_reward: Of the move into the goal: 0 in the authors' code; -1 in the paper's text.
+
     Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task";
     `docs/reference.md` 6.1.
     """
@@ -142,11 +145,7 @@ class CliffWalking(Options):
         observation=Discrete(48), action=Discrete(4), max_steps=50, solved_reward=-20.0
     )
 
-    goal_reward: float = option(
-        0.0,
-        finite("it is a reward"),
-        help="Of the move into the goal: 0 in the authors' code; -1 in the paper's text.",
-    )
+    goal_reward: float = option(0.0, finite("it is a reward"))
 
     def make(self) -> Task:
         params = GridParams(

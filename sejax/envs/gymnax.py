@@ -26,6 +26,10 @@ SOLVED_REWARD = {
 class GymnaxTask(Options):
     """One of gymnax's environments as it is, or as another package has registered it there.
 
+    Attributes:
+      solved_reward: mean return that counts as solved; null: Gymnasium's
+      max_steps: null: gymnax's
+
     Raises:
       ConfigError: when it is made, for an id that gymnax does not know or cannot make.
     """
@@ -33,10 +37,8 @@ class GymnaxTask(Options):
     group: ClassVar[str] = "env"
 
     name: str = f"{PREFIX}CartPole-v1"
-    solved_reward: float | None = option(
-        None, help="mean return that counts as solved; null: Gymnasium's"
-    )
-    max_steps: int | None = option(None, counts("an episode has steps"), help="null: gymnax's")
+    solved_reward: float | None = None
+    max_steps: int | None = option(None, counts("an episode has steps"))
 
     def make(self) -> Task:
         import gymnax

@@ -45,6 +45,10 @@ SUITES = {
 class StoaTask(Options):
     """An environment of a suite that stoa has an adapter for.
 
+    Attributes:
+      solved_reward: mean return that counts as solved; null: undefined
+      max_steps: null: the environment's own, or 1,000 where it has none.
+
     Raises:
       ConfigError: when it is made, for a suite that is not known or not installed, or an id that it
         cannot make.
@@ -53,12 +57,8 @@ class StoaTask(Options):
     group: ClassVar[str] = "env"
 
     name: str = f"{PREFIX}navix/Navix-Empty-5x5-v0"
-    solved_reward: float | None = option(
-        None, help="mean return that counts as solved; null: undefined"
-    )
-    max_steps: int | None = option(
-        None, counts("an episode has steps"), help="null: the environment's own, or 1,000"
-    )
+    solved_reward: float | None = None
+    max_steps: int | None = option(None, counts("an episode has steps"))
 
     def make(self) -> Task:
         suite, _, name = self.name.removeprefix(PREFIX).partition("/")

@@ -122,22 +122,23 @@ class Strategy:
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyOptions(Options):
-    """What the configurations of sejax's strategies share."""
+    """What the configurations of sejax's strategies share.
+
+    Attributes:
+      population_size: n_p: perturbations in a generation
+      num_evals: agents on each candidate
+      eval_aggregate: how their scores become one
+      common_random_numbers: the same inner seeds for all candidates of a generation
+    """
 
     group: ClassVar[str] = "es"
 
     population_size: int = option(
-        16,
-        counts("scores are compared within a generation", 2, MOST_MEMBERS),
-        help="n_p: perturbations in a generation",
+        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
     )
-    num_evals: int = option(1, counts("a candidate needs a score"), help="agents on each candidate")
-    eval_aggregate: str = option(
-        "mean", one_of(("mean", "min")), help="how their scores become one"
-    )
-    common_random_numbers: bool = option(
-        False, help="the same inner seeds for all candidates of a generation"
-    )
+    num_evals: int = option(1, counts("a candidate needs a score"))
+    eval_aggregate: str = option("mean", one_of(("mean", "min")))
+    common_random_numbers: bool = False
 
     def evaluations(self, num_incumbent_evals: int) -> Evaluations:
         """How often each candidate is evaluated."""

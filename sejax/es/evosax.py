@@ -50,24 +50,20 @@ class EvosaxConfig(StrategyOptions):
 
     They are set explicitly because evosax's defaults (std 1, learning rate 1e-3) either destroy a
     small network or hardly move it. For another algorithm of evosax see `from_evosax`.
+
+    Attributes:
+      num_incumbent_evals: Agents trained on the distribution's mean.
+      noise_std: Initial std of the search distribution.
+      noise_std_decay: Factor for each generation, of open_es alone.
+      step_size: Learning rate of Adam on the mean, of open_es and pgpe.
     """
 
     name: str = option("open_es", one_of(ALGORITHMS))
     population_size: int = 32
-    num_incumbent_evals: int = option(
-        16, counts("the incumbent's score selects the proxy"), help="Agents trained on the mean."
-    )
-    noise_std: float = option(
-        0.05, positive("candidates must differ", MAX_SCALE), help="Initial std of the distribution."
-    )
-    noise_std_decay: float = option(
-        1.0, shrinks(), help="Factor for each generation, of open_es alone."
-    )
-    step_size: float = option(
-        0.05,
-        positive("the mean would not move", MAX_SCALE),
-        help="Learning rate of Adam on the mean, of open_es and pgpe.",
-    )
+    num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
+    noise_std: float = option(0.05, positive("candidates must differ", MAX_SCALE))
+    noise_std_decay: float = option(1.0, shrinks())
+    step_size: float = option(0.05, positive("the mean would not move", MAX_SCALE))
 
     def __post_init__(self) -> None:
         super().__post_init__()

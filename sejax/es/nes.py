@@ -25,41 +25,32 @@ class NESConfig(StrategyOptions):
 
     The defaults are what was measured to work for SEs (docs/defaults.md); `preset=paper` has the
     paper's.
+
+    Attributes:
+      population_size: n_p: perturbations of a generation
+      num_incumbent_evals: Agents on the incumbent; null: one for each perturbation, as in the
+        paper.
+      noise_std: sigma: std of the weight perturbation
+      noise_std_decay: factor on sigma after each generation
+      step_size: alpha: step size of the update
+      step_size_decay: factor on alpha after each generation
+      mirrored: each perturbation is tried as +eps and -eps and keeps its better sign
+      score_transform: A name, or my_module:my_function of scores `[pop]` that gives weights
+        `[pop]`.
+      update_rule: authors: psi += alpha sum F eps; paper: that divided by n_p sigma
+      weight_decay: psi shrinks by this before each update
     """
 
-    population_size: int = option(64, help="n_p: perturbations of a generation")
-    num_incumbent_evals: int | None = option(
-        16,
-        counts("the incumbent's score selects the proxy"),
-        help="Agents on the incumbent; null: one for each perturbation, as in the paper.",
-    )
-    noise_std: float = option(
-        0.06,
-        positive("candidates must differ", MAX_SCALE),
-        help="sigma: std of the weight perturbation",
-    )
-    noise_std_decay: float = option(0.97, shrinks(), help="factor on sigma after each generation")
-    step_size: float = option(
-        1.0,
-        positive("the proxy would not move", MAX_SCALE),
-        help="alpha: step size of the update",
-    )
-    step_size_decay: float = option(1.0, shrinks(), help="factor on alpha after each generation")
-    mirrored: bool = option(
-        True, help="each perturbation is tried as +eps and -eps and keeps its better sign"
-    )
-    score_transform: str | OwnTransform = option(
-        "all_better_2",
-        require_transform,
-        names_code=True,
-        help="A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.",
-    )
-    update_rule: str = option(
-        "authors",
-        one_of(UPDATE_RULES),
-        help="authors: psi += alpha sum F eps; paper: that divided by n_p sigma",
-    )
-    weight_decay: float = option(0.0, fraction(), help="psi shrinks by this before each update")
+    population_size: int = 64
+    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
+    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE))
+    noise_std_decay: float = option(0.97, shrinks())
+    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE))
+    step_size_decay: float = option(1.0, shrinks())
+    mirrored: bool = True
+    score_transform: str | OwnTransform = option("all_better_2", require_transform, names_code=True)
+    update_rule: str = option("authors", one_of(UPDATE_RULES))
+    weight_decay: float = option(0.0, fraction())
 
     def make(self, num_dims: int) -> Strategy:
         """NES over vectors of `num_dims` numbers."""

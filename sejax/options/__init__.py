@@ -1,15 +1,22 @@
 """Options: the fields of a configuration, their checks, and the errors that bad input raises.
 
 A configuration is a frozen dataclass that can make what it configures. Each of its fields is
-written once: name, type, default, the rule that a value must obey, and the text of `--help`.
+written once: name, type, default, and the rule that a value must obey. What the docstring says of
+a field under `Attributes:` is the text of `--help`.
 
 Every message has one form: the field, what must hold, why, what came, and how to fix it.
 
 Example:
   >>> @dataclasses.dataclass(frozen=True, kw_only=True)
   ... class Config(Options):
+  ...     '''An agent.
+  ...
+  ...     Attributes:
+  ...       batch_size: transitions of an update.
+  ...     '''
+  ...
   ...     group: ClassVar[str] = "agent"
-  ...     batch_size: int = option(128, counts(), help="transitions of an update")
+  ...     batch_size: int = option(128, counts())
   >>> Config(batch_size=0)
   Traceback (most recent call last):
   sejax.options.ConfigError: agent.batch_size must be a whole number from 1 to 2147483647, because \
@@ -19,6 +26,7 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 import contextlib
 import dataclasses
 import difflib
+import inspect
 import numbers
 import os
 import re
@@ -149,7 +157,6 @@ def option(
     default: Any = dataclasses.MISSING,
     rule: Rule | None = None,
     *,
-    help: str = "",
     traced: bool = False,
     varied: str | None = None,
     names_code: bool = False,
@@ -159,14 +166,12 @@ def option(
     Args:
       default: its default; without one it must be given.
       rule: what must hold; None passes it where that is the default or `... | None` the type.
-      help: what `--help` says of it.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
       names_code: whether its text may be a `module:attribute`, which no file may name.
     """
     metadata = {"rule": rule, "traced": traced, "varied": varied, "names_code": names_code}
-    metadata |= {"help": help} if help else {}  # else that of the class which a subclass overrides
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -224,9 +229,14 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
 
 def help_texts(cls: type) -> dict[str, str]:
-    """What `--help` says of a dataclass's fields, by their names."""
-    texts = {x.name: marks(cls, x.name).get("help", "") for x in dataclasses.fields(cls)}
-    return {name: text for name, text in texts.items() if text}
+    """What the docstrings of a class and its bases say of its attributes, by their names."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        _, _, rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")
+        section = re.split(r"\n\n(?=\S)", rest)[0]
+        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
+        texts |= {name: " ".join(text.split()) for name, text in entries}
+    return texts
 
 
 def is_number(value: object) -> bool:

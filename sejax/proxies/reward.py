@@ -61,7 +61,14 @@ VARIANTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(ProxyConfig):
-    """The RN's network, and how its output makes a reward."""
+    """The RN's network, and how its output makes a reward.
+
+    Attributes:
+      output_scale: Phi is this times the network's output. Some agents learn only from small
+        rewards (docs/results.md, MountainCarContinuous).
+      augmented: the network sees the task's vector v as well
+      zero_at_terminal: Phi is 0 where episodes end for the agent; see RewardEnv
+    """
 
     default_objective: ClassVar[str] = "reward_threshold"
     has_real_dynamics: ClassVar[bool] = True
@@ -70,18 +77,9 @@ class RewardConfig(ProxyConfig):
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
-    output_scale: float = option(
-        1.0,
-        positive("a reward of 0 teaches nothing", 1e6),
-        help=(
-            "Phi is this times the network's output. Some agents learn only from small rewards "
-            "(docs/results.md, MountainCarContinuous)."
-        ),
-    )
-    augmented: bool = option(False, help="the network sees the task's vector v as well")
-    zero_at_terminal: bool = option(
-        False, help="Phi is 0 where episodes end for the agent; see RewardEnv"
-    )
+    output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
+    augmented: bool = False
+    zero_at_terminal: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

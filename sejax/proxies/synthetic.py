@@ -65,76 +65,41 @@ class SyntheticConfig(ProxyConfig):
 
     The default is the contextual bandit of Liesen et al. (2024): everything about it is seen by any
     agent. The paper's SE is `initial_state=real horizon=null done=soft`.
+
+    Attributes:
+      done: How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 -
+        d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
+        with probability sigmoid(d). Agents see all ends but the first.
+      min_steps: First step of an episode that d may end it at; before it, targets bootstrap with 1.
+        An SE of episodes of a step or two is a bandit, whatever its networks could do.
+      initial_state: real: the task's initial states; learned: standard normal noise plus a
+        network's output for it; noise: noise alone, in the units of `state_units`.
+      state_units: Units in which the networks see and make states. raw: the task's own; bounds: 0
+        is the middle of a bounded observation and 1 is half of the way to its bound. A car's
+        velocity lies in [-0.07, 0.07], where noise of 1 would be no measure.
+      horizon: Steps of an episode; null: the task's limit. 1: a contextual bandit, which has
+        neither a next-state nor a done network.
+      reward_form: What the reward network of a bandit makes. network: the reward of an action;
+        distance, quadratic: the best of continuous actions, in units of their bound, from which the
+        reward is minus the sum of the distances, or of their squares, so that the best policy is
+        known.
+      reward_slope: What such a reward takes for each unit of it.
+      horizon_is_terminal: Whether the horizon terminates an episode, so that nothing is
+        bootstrapped there, or truncates it, as the task's limit does.
     """
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    done: str = option(
-        "threshold",
-        one_of(DONE_MODES),
-        help=(
-            "How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with "
-            "1 - d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, "
-            "1); sigmoid: with probability sigmoid(d). Agents see all ends but the first."
-        ),
-    )
-    min_steps: int = option(
-        1,
-        counts("an episode has steps"),
-        help=(
-            "First step of an episode that d may end it at; before it, targets bootstrap with 1. "
-            "An SE of episodes of a step or two is a bandit, whatever its networks could do."
-        ),
-    )
-    initial_state: str = option(
-        "learned",
-        one_of(INITIAL_STATES),
-        help=(
-            "real: the task's initial states; learned: standard normal noise plus a network's "
-            "output for it; noise: noise alone, in the units of `state_units`."
-        ),
-    )
-    state_units: str = option(
-        "raw",
-        one_of(STATE_UNITS),
-        help=(
-            "Units in which the networks see and make states. raw: the task's own; bounds: 0 is "
-            "the middle of a bounded observation and 1 is half of the way to its bound. A car's "
-            "velocity lies in [-0.07, 0.07], where noise of 1 would be no measure."
-        ),
-    )
-    horizon: int | None = option(
-        1,
-        counts("an episode has steps"),
-        help=(
-            "Steps of an episode; null: the task's limit. 1: a contextual bandit, which has "
-            "neither a next-state nor a done network."
-        ),
-    )
-    reward_form: str = option(
-        "network",
-        one_of(REWARD_FORMS),
-        help=(
-            "What the reward network of a bandit makes. network: the reward of an action; "
-            "distance, quadratic: the best of continuous actions, in units of their bound, from "
-            "which the reward is minus the sum of the distances, or of their squares, so that the"
-            " best policy is known."
-        ),
-    )
-    reward_slope: float = option(
-        1.0,
-        positive("a reward must tell actions apart"),
-        help="What such a reward takes for each unit of it.",
-    )
+    done: str = option("threshold", one_of(DONE_MODES))
+    min_steps: int = option(1, counts("an episode has steps"))
+    initial_state: str = option("learned", one_of(INITIAL_STATES))
+    state_units: str = option("raw", one_of(STATE_UNITS))
+    horizon: int | None = option(1, counts("an episode has steps"))
+    reward_form: str = option("network", one_of(REWARD_FORMS))
+    reward_slope: float = option(1.0, positive("a reward must tell actions apart"))
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
-    horizon_is_terminal: bool = option(
-        True,
-        help=(
-            "Whether the horizon terminates an episode, so that nothing is bootstrapped there, or"
-            " truncates it, as the task's limit does."
-        ),
-    )
+    horizon_is_terminal: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -60,15 +60,15 @@ NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 
 @dataclass(frozen=True, kw_only=True)
 class Share(Options):
-    """An agent's part in a mixture: `agents.KEY.weight`."""
+    """An agent's part in a mixture: `agents.KEY.weight`.
+
+    Attributes:
+      weight: share of the candidates that train it; with 0 it only judges incumbents
+    """
 
     group: ClassVar[str] = "share"
 
-    weight: float = option(
-        1.0,
-        between(0, 1e6, "it is a share of the candidates"),
-        help="share of the candidates that train it; with 0 it only judges incumbents",
-    )
+    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
 
 
 @dataclass(frozen=True)

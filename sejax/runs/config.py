@@ -63,21 +63,22 @@ class CommandConfig(Options):
       groups: the groups of plugins whose choices are fields.
       learns: whether proxies are learned: presets have settings, several agents have shares.
       agents: by their keys, in the order of these; see `sejax.runs.compose.agents_of`.
+      exploration: intrinsic reward of the agents
+      training: on proxies
+      num_parallel: Agents that train side by side on one device; null: what suits the agent and the
+        device.
+      devices: null: all
     """
 
     groups: ClassVar[tuple[str, ...]] = ()
     learns: ClassVar[bool] = False
 
     agents: dict[str, AgentConfig]
-    exploration: ExplorationConfig = option(help="intrinsic reward of the agents")
-    training: TrainingConfig = option(TRAINING, help="on proxies")
+    exploration: ExplorationConfig
+    training: TrainingConfig = TRAINING
     seed: int = option(0, seed())
-    num_parallel: int | None = option(
-        None,
-        counts("something must compute"),
-        help="agents side by side on a device; null: what suits",
-    )
-    devices: int | None = option(None, counts("something must compute"), help="null: all")
+    num_parallel: int | None = option(None, counts("something must compute"))
+    devices: int | None = option(None, counts("something must compute"))
 
     @property
     def agent(self) -> Any:
@@ -110,6 +111,23 @@ class CommandConfig(Options):
 class LearnConfig(CommandConfig):
     """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
 
+    Attributes:
+      weights: of the agents; equal if not given
+      preset: settings that were measured (best) or published (paper)
+      env: the real task
+      proxy: what is learned: a synthetic environment (se) or a reward network (rn)
+      es: the evolution strategy of the outer loop
+      objective: what the outer loop maximises
+      tracker: follows the run beside its files
+      machines: where agents train
+      agent_hparams: default: the agent's; varied: learning rate, batch and network drawn anew for
+        each training.
+      generations: n_o: steps of the outer loop.
+      num_seeds: Independent runs, with seeds seed, seed + 1, ...
+      stop_when_solved: End a run at its first incumbent mean that reaches the solved threshold.
+      checkpoint_every: generations between checkpoints
+      run_dir: null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
+
     Raises:
       ConfigError: for parts that cannot work together.
     """
@@ -121,37 +139,21 @@ class LearnConfig(CommandConfig):
         *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
     )
 
-    weights: tuple[float, ...] = option((), help="of the agents; equal if not given")
+    weights: tuple[float, ...] = option(())
     mixture: MixtureConfig = option(MixtureConfig())
-    preset: str = option("best", help="settings that were measured (best) or published (paper)")
-    env: Any = option(help="the real task")
-    proxy: Any = option(
-        help="what is learned: a synthetic environment (se) or a reward network (rn)"
-    )
-    es: Any = option(help="the evolution strategy of the outer loop")
-    objective: Any = option(help="what the outer loop maximises")
-    tracker: Any = option(help="follows the run beside its files")
-    machines: Any = option(help="where agents train")
-    agent_hparams: str = option(
-        "default",
-        one_of(AGENT_HPARAMS),
-        help="varied: rate, batch, network drawn for each training",
-    )
-    generations: int = option(
-        100, counts("there is nothing to do otherwise", most=1_000_000), help="n_o: outer steps"
-    )
-    num_seeds: int = option(
-        1, counts("it counts runs"), help="Independent runs, with seeds seed, seed + 1, ..."
-    )
-    stop_when_solved: bool = option(
-        False, help="End a run at its first incumbent mean that reaches the solved threshold."
-    )
-    checkpoint_every: int = option(
-        1, counts("it counts generations"), help="generations between checkpoints"
-    )
-    run_dir: str | None = option(
-        None, help="null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>"
-    )
+    preset: str = "best"
+    env: Any
+    proxy: Any
+    es: Any
+    objective: Any
+    tracker: Any
+    machines: Any
+    agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
+    generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
+    num_seeds: int = option(1, counts("it counts runs"))
+    stop_when_solved: bool = False
+    checkpoint_every: int = option(1, counts("it counts generations"))
+    run_dir: str | None = None
 
     def sections(self) -> Iterator[tuple[str, str, Any]]:
         yield from super().sections()
@@ -249,45 +251,33 @@ class LearnConfig(CommandConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(CommandConfig):
-    """What `sejax.evaluate` takes."""
+    """What `sejax.evaluate` takes.
+
+    Attributes:
+      proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
+      env: the task, where proxy=real or the proxy's is your own
+      proxy_kind: my_module:MyProxy, where the proxy is of a kind of your own
+      agent_hparams: as_learned: agents and exploration that the proxy was learned with, where no
+        agent is named; default: the agent's; varied: drawn around them for each agent.
+      training_from: How long agents train on the proxy. proxy: on an SE as it was learned with, on
+        a reward network as on the real task (as_learned: with the time limit as in its run);
+        config: as `training` says.
+      baseline: as many agents trained on the real task, beside them
+      out_dir: null: beside the proxy (runs/evaluate-<name> without a folder)
+      real_training: On the real task, and how all agents are tested unless training_from=config.
+    """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration",)
 
-    proxy: str = option(
-        help="a run directory, a safetensors file, a shipped name (cartpole), or real"
-    )
-    env: str | None = option(
-        None, names_code=True, help="the task, where proxy=real or the proxy's is your own"
-    )
-    proxy_kind: str | None = option(
-        None, names_code=True, help="my_module:MyProxy, where the proxy is of a kind of your own"
-    )
-    agent_hparams: str = option(
-        "default",
-        one_of(EVALUATION_HPARAMS),
-        help=(
-            "as_learned: agents and exploration that the proxy was learned with, where no agent "
-            "is named; default: the agent's; varied: drawn around them for each agent."
-        ),
-    )
-    training_from: str = option(
-        "proxy",
-        one_of(TRAINING_FROM),
-        help=(
-            "How long agents train on the proxy. proxy: on an SE as it was learned with, on a "
-            "reward network as on the real task (as_learned: with the time limit as in its run); "
-            "config: as `training` says."
-        ),
-    )
+    proxy: str
+    env: str | None = option(None, names_code=True)
+    proxy_kind: str | None = option(None, names_code=True)
+    agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
+    training_from: str = option("proxy", one_of(TRAINING_FROM))
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
-    baseline: bool = option(True, help="as many agents trained on the real task, beside them")
-    out_dir: str | None = option(
-        None, help="null: beside the proxy (runs/evaluate-<name> without a folder)"
-    )
-    real_training: TrainingConfig = option(
-        REAL_TRAINING,
-        help="On the real task, and how all agents are tested unless training_from=config.",
-    )
+    baseline: bool = True
+    out_dir: str | None = None
+    real_training: TrainingConfig = REAL_TRAINING
 
     @staticmethod
     def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:

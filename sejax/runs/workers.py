@@ -71,17 +71,21 @@ class LocalConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class RayConfig(Options):
-    """Worker processes on a Ray cluster."""
+    """Worker processes on a Ray cluster.
+
+    Attributes:
+      address: HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or
+        local
+      workers: worker processes; null: one for each CPU core of the cluster, or for each GPU
+      gpus_per_worker: 0: a worker computes on a CPU core; 0.5: two workers share a GPU
+    """
 
     group: ClassVar[str] = "machines"
     is_elsewhere: ClassVar[bool] = True
     package: ClassVar[str] = "ray"
 
-    # HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or local
     address: str | None = None
-    # worker processes; null: one for each CPU core of the cluster, or for each GPU
     workers: int | None = option(None, counts("somebody must compute"))
-    # 0: a worker computes on a CPU core; 0.5: two workers share a GPU
     gpus_per_worker: float = option(0.0, fraction())
 
     @contextlib.contextmanager

@@ -41,24 +41,30 @@ class SearchConfig(Options):
 
     The defaults are the paper's setting, BOHB with a reduction factor of 3 (appendix, "SE
     hyperparameters"; `docs/reference.md` 7.10).
+
+    Attributes:
+      trials: trials that end, pruned or complete
+      min_generations: before a trial may be pruned; as many as max_generations: none is
+      max_generations: of a trial that is not pruned
+      seeds: runs of a trial, whose mean counts
+      space: a preset of ranges, or FILE.yaml
+      study: null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
+      search_dir: null: runs/search-<study>
+      verify: The best trials that are tried again, as the best score of many is the luckiest too:
+        on the real task after a search on a proxy, else with seeds that are new.
+      fresh_seeds: new seeds of each that is tried again
     """
 
     group: ClassVar[str] = ""
 
-    # trials that end, pruned or complete
     trials: int = option(60, counts("there is nothing to compare otherwise"))
-    # before a trial may be pruned; as many as max_generations: none is
     min_generations: int = option(3, counts("a trial must show something"))
-    # of a trial that is not pruned
     max_generations: int = option(27, counts("there is nothing to do otherwise"))
-    seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial, whose mean counts
-    space: str | None = None  # a preset of ranges, or FILE.yaml
-    study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
-    search_dir: str | None = None  # null: runs/search-<study>
-    # The best trials that are tried again, as the best score of many is the luckiest too: on the
-    # real task after a search on a proxy, else with seeds that are new.
+    seeds: int = option(1, counts("a trial needs a run"))
+    space: str | None = None
+    study: str | None = None
+    search_dir: str | None = None
     verify: int = option(5, counts("the best are tried again", least=0))
-    # new seeds of each that is tried again
     fresh_seeds: int = option(5, counts("the best are tried again with them"))
 
     def __post_init__(self) -> None:

@@ -78,6 +78,9 @@ class MujocoTask(Options):
 class HalfCheetah(MujocoTask):
     """A planar cheetah that is paid for running and charged for torque.
 
+    Attributes:
+      backend: physics
+
     Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
     """
 
@@ -85,7 +88,7 @@ class HalfCheetah(MujocoTask):
     model = "HalfCheetahEnv"
     spec = _spec(17, 6, solved_reward=3000.0, info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"))
 
-    backend: str = option("mujoco", one_of(BACKENDS), help="physics")
+    backend: str = option("mujoco", one_of(BACKENDS))
 
     def make(self) -> Task:
         if self.backend == "mujoco":
@@ -164,7 +167,11 @@ class InvertedPendulum(MujocoTask):
 
 @dataclass(frozen=True, kw_only=True)
 class Ant(Runner):
-    """A body on four legs that is paid for walking in one direction and for its health."""
+    """A body on four legs that is paid for walking in one direction and for its health.
+
+    Attributes:
+      include_cfrc_ext_in_observation: external forces on each body
+    """
 
     name = "ant"
     model = "AntEnv"
@@ -173,7 +180,7 @@ class Ant(Runner):
     contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
-    include_cfrc_ext_in_observation: bool = option(True, help="external forces on each body")
+    include_cfrc_ext_in_observation: bool = True
 
     @property
     def spec(self) -> TaskSpec:
