@@ -160,4 +160,3 @@ def test_fields_have_help_texts_which_a_subclass_keeps():
         batch_size: int = 3
 
     assert options.help_texts(Mine)["batch_size"] == "transitions"
-    assert set(options.help_texts(Mine)) <= {field.name for field in dataclasses.fields(Mine)}

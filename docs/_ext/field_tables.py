@@ -1,6 +1,7 @@
 """A table of a dataclass's fields, under its docstring: type, default, and what it is.
 
-What a field is stands beside it in the source, in a comment, and is written nowhere else.
+What a field of options is stands in the docstring, under `Attributes:`, which the table replaces;
+what another field is stands beside it in the source, in a comment.
 """
 
 import ast
@@ -15,6 +16,7 @@ from typing import Any
 from sphinx.application import Sphinx
 
 from experiments.common.experiment import Settings
+from sejax.options import Options, help_texts
 
 
 def comments_of_fields(cls: type) -> dict[str, str]:
@@ -43,6 +45,7 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
             comments |= {name: text for name, text in comments_of_fields(base).items() if text}
+    comments |= help_texts(cls)
     shared = (
         dataclasses.fields(Settings) if cls is not Settings and issubclass(cls, Settings) else ()
     )
@@ -54,9 +57,15 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
 
 
 def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:
-    """Adds the table to a dataclass whose docstring does not list its attributes."""
-    if what != "class" or not dataclasses.is_dataclass(cls) or "Attributes:" in (cls.__doc__ or ""):
+    """Adds the table to options, and to a dataclass whose docstring does not list its attributes."""
+    if what != "class" or not dataclasses.is_dataclass(cls):
         return
+    if "Attributes:" in lines:
+        if not issubclass(cls, Options):
+            return
+        start = lines.index("Attributes:")
+        end = next((i for i in range(start + 1, len(lines)) if lines[i][:1].strip()), len(lines))
+        del lines[start:end]
     table = list(rows(cls))
     if not table:
         return
@@ -90,7 +99,7 @@ def skip_aliases(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    app.connect("autodoc-process-docstring", add_table)
+    app.connect("autodoc-process-docstring", add_table, priority=400)  # before napoleon's
     app.connect("autodoc-process-signature", shorten_signature)
     app.connect("autodoc-skip-member", skip_aliases)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
