@@ -62,25 +62,40 @@ STUDENT_STEPS = {"pendulum": 10_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 class NullBaselines(Settings):
     name = "null_baselines"
 
-    env: str = setting("cartpole", one_of(tuple(TEACHERS)))  # the task
-    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))  # what makes the proxies
-    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
-    # Hyperparameters of the students; varied: drawn for each.
-    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
-    policies: int = count(12, quick=2)  # of each source and kind of teacher
-    num_agents: int = count(5, quick=2)  # of each kind on each proxy
-    num_evolved: int = count(20, quick=2)  # agents of each kind on the shipped SE
-    steps: int | None = count(None, quick=500)  # of a student; 2,000, more on hard tasks
-    # Students with default hyperparameters also train for these shares of the steps.
-    shares: tuple[float, ...] = setting((0.125, 0.25, 0.5), quick=(0.5,))
-    teacher_steps: int | None = count(None, quick=500)  # of a teacher; by the task
-    # Real steps of a search, at most; those of the shipped SE.
-    search_steps: int | None = count(None, quick=5_000)
-    num_states: int = count(1024)  # of a table
-    # States of a table. visited: half of them, half drawn around these; noise: as those in which
-    # episodes of the task's SEs begin. Those of `episodes` are visited ones.
-    states: str = setting("visited", one_of(("visited", "noise")))
-    widen: float = setting(1.5, positive("it is a scale"))  # spread of those around visited states
+    env: str = setting("cartpole", one_of(tuple(TEACHERS)), help="the task")
+    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES), help="what makes the proxies")
+    students: tuple[str, ...] = setting((), help="kinds of agents; all that fit the task")
+    hparams: tuple[str, ...] = setting(
+        HPARAMS,
+        each_of(HPARAMS),
+        quick=("default",),
+        help="Hyperparameters of the students; varied: drawn for each.",
+    )
+    policies: int = count(12, quick=2, help="of each source and kind of teacher")
+    num_agents: int = count(5, quick=2, help="of each kind on each proxy")
+    num_evolved: int = count(20, quick=2, help="agents of each kind on the shipped SE")
+    steps: int | None = count(None, quick=500, help="of a student; 2,000, more on hard tasks")
+    shares: tuple[float, ...] = setting(
+        (0.125, 0.25, 0.5),
+        quick=(0.5,),
+        help="Students with default hyperparameters also train for these shares of the steps.",
+    )
+    teacher_steps: int | None = count(None, quick=500, help="of a teacher; by the task")
+    search_steps: int | None = count(
+        None, quick=5_000, help="Real steps of a search, at most; those of the shipped SE."
+    )
+    num_states: int = count(1024, help="of a table")
+    states: str = setting(
+        "visited",
+        one_of(("visited", "noise")),
+        help=(
+            "States of a table. visited: half of them, half drawn around these; noise: as those "
+            "in which episodes of the task's SEs begin. Those of `episodes` are visited ones."
+        ),
+    )
+    widen: float = setting(
+        1.5, positive("it is a scale"), help="spread of those around visited states"
+    )
 
     @property
     def task(self) -> envs.Task:

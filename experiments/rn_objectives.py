@@ -40,10 +40,16 @@ DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 class RnObjectives(CurveSettings):
     name = "rn_objectives"
 
-    # Of reward_threshold, auc, max_reward, auc_sum.
-    objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES))
-    # RNs that train agents: best, worst (as the authors' scripts for two objectives).
-    picks: tuple[str, ...] = setting(PICKS, each_of(PICKS))
+    objectives: tuple[str, ...] = setting(
+        DEFAULT_OBJECTIVES,
+        each_of(OBJECTIVE_NAMES),
+        help="Of reward_threshold, auc, max_reward, auc_sum.",
+    )
+    picks: tuple[str, ...] = setting(
+        PICKS,
+        each_of(PICKS),
+        help="RNs that train agents: best, worst (as the authors' scripts for two objectives).",
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:

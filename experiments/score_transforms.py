@@ -77,11 +77,11 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 class ScoreTransforms(Settings):
     name = "score_transforms"
 
-    runs: int = count(220, quick=12)  # of each transform, with mirrored sampling and without
-    generations: int = count(50, quick=10)  # of a run at most
-    population: int = count(16, least=2, quick=8)  # candidates of a generation
-    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS))  # to compare
-    bins: int = count(9, quick=3)  # of step sizes
+    runs: int = count(220, quick=12, help="of each transform, with mirrored sampling and without")
+    generations: int = count(50, quick=10, help="of a run at most")
+    population: int = count(16, least=2, quick=8, help="candidates of a generation")
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS), help="to compare")
+    bins: int = count(9, quick=3, help="of step sizes")
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:

@@ -38,12 +38,15 @@ QUICK = (
 class SeDistilled(Settings):
     name = "se_distilled"
 
-    env: str = setting("halfcheetah")  # task
-    # Kinds of students; all that the task's preset has.
-    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
-    num_seeds: int = count(3, quick=2)  # whole runs of the command
-    num_tested: int = count(10, quick=2)  # students of each kind on the SE that is kept
-    run: tuple[str, ...] = setting(())  # overrides of the command
+    env: str = setting("halfcheetah", help="task")
+    students: tuple[str, ...] = setting(
+        (),
+        each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))),
+        help="Kinds of students; all that the task's preset has.",
+    )
+    num_seeds: int = count(3, quick=2, help="whole runs of the command")
+    num_tested: int = count(10, quick=2, help="students of each kind on the SE that is kept")
+    run: tuple[str, ...] = setting((), help="overrides of the command")
 
     @property
     def kinds(self) -> tuple[str, ...]:

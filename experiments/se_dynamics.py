@@ -68,16 +68,22 @@ NOT_BANDIT = {
 class SeDynamics(RunSettings):
     name = "se_dynamics"
 
-    generations: int | None = count(40, quick=3)  # outer iterations
-    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
-    runs: int = count(10, quick=2)  # NES runs of each kind
-    max_steps: int = count(4000, quick=1000)  # of an agent, but on bandits
-    # Kinds of agents; all that fit the task.
-    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
-    num_agents: int = count(10, quick=5)  # of each kind and discount on each SE
-    test_episodes: int = count(10)  # of each agent
-    # Difference that counts as none, as in se_myopia.
-    margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
+    generations: int | None = count(40, quick=3, help="outer iterations")
+    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)), help="of SEs")
+    runs: int = count(10, quick=2, help="NES runs of each kind")
+    max_steps: int = count(4000, quick=1000, help="of an agent, but on bandits")
+    students: tuple[str, ...] = setting(
+        (),
+        each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))),
+        help="Kinds of agents; all that fit the task.",
+    )
+    num_agents: int = count(10, quick=5, help="of each kind and discount on each SE")
+    test_episodes: int = count(10, help="of each agent")
+    margin: float = setting(
+        0.1,
+        positive("a difference is never measured as 0", 1),
+        help="Difference that counts as none, as in se_myopia.",
+    )
 
     @property
     def tested(self) -> tuple[str, ...]:

@@ -38,9 +38,11 @@ PAPER = {
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
 
-    generations: int | None = count(None, quick=8)  # outer iterations; the preset's
-    runs: int = count(10, quick=3)  # independent NES runs
-    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))  # varied: drawn for each agent
+    generations: int | None = count(None, quick=8, help="outer iterations; the preset's")
+    runs: int = count(10, quick=3, help="independent NES runs")
+    agent_hparams: str = setting(
+        "default", one_of(AGENT_HPARAMS), help="varied: drawn for each agent"
+    )
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:

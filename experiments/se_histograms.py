@@ -80,11 +80,13 @@ PAPER_RETURNS = {
 class SeHistograms(Settings):
     name = "se_histograms"
 
-    proxy: str = setting(SOFT_SE)  # SE: a run directory, a file or a shipped name
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents, a row each
-    num_agents: int = count(10, quick=3)  # of each kind
-    test_episodes: int = count(10)  # of each agent
-    max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
+    proxy: str = setting(SOFT_SE, help="SE: a run directory, a file or a shipped name")
+    agents: tuple[str, ...] = setting(
+        SE_AGENTS, each_of(SE_AGENTS), help="kinds of agents, a row each"
+    )
+    num_agents: int = count(10, quick=3, help="of each kind")
+    test_episodes: int = count(10, help="of each agent")
+    max_rows: int = count(10_000, help="transitions of training, the last ones of an agent")
 
 
 def compute(settings: SeHistograms) -> pd.DataFrame:

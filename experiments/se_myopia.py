@@ -57,15 +57,27 @@ UNTRAINED = "untrained"
 class SeMyopia(Settings):
     name = "se_myopia"
 
-    env: str = setting("cartpole")  # task of the SEs
-    # Files of SEs, run directories or shipped names; all that are shipped and in results/.
-    ses: tuple[str, ...] = setting((), quick=("cartpole", SOFT_SE))
-    num_ses: int = count(5, quick=1)  # the first SEs of each set
-    num_agents: int = count(20, quick=5)  # on each SE with each discount
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=1000)  # of training; as the SE's configuration says
-    # Difference that counts as none, as a share of the way from untrained agents to solved.
-    margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
+    env: str = setting("cartpole", help="task of the SEs")
+    ses: tuple[str, ...] = setting(
+        (),
+        quick=("cartpole", SOFT_SE),
+        help=(
+            "Files of SEs, run directories or shipped names; all that are shipped and in results/."
+        ),
+    )
+    num_ses: int = count(5, quick=1, help="the first SEs of each set")
+    num_agents: int = count(20, quick=5, help="on each SE with each discount")
+    test_episodes: int = count(10, help="of each agent")
+    max_steps: int | None = count(
+        None, quick=1000, help="of training; as the SE's configuration says"
+    )
+    margin: float = setting(
+        0.1,
+        positive("a difference is never measured as 0", 1),
+        help=(
+            "Difference that counts as none, as a share of the way from untrained agents to solved."
+        ),
+    )
 
 
 class Se(NamedTuple):

@@ -70,17 +70,21 @@ PAPER_RETURNS = {
 class SePerformance(Settings):
     name = "se_performance"
 
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
-    num_agents: int = count(10, quick=4)  # for each SE
-    num_ses: int = count(40, quick=3)  # SEs of a set at most
-    test_episodes: int = count(10)  # of each agent
-    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
-    varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
-    fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
-    # Groups of agents on the real task, which is slow; as many as SEs.
-    real_groups: int | None = count(None)
-    # On the real task; 1000 (discrete TD3 in Acrobot 500).
-    real_episodes: int | None = count(None, quick=100)
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS), help="kinds of agents")
+    num_agents: int = count(10, quick=4, help="for each SE")
+    num_ses: int = count(40, quick=3, help="SEs of a set at most")
+    test_episodes: int = count(10, help="of each agent")
+    max_steps: int | None = count(
+        None, quick=4000, help="of training; as the SEs' configuration says"
+    )
+    varied: str | None = setting(None, help="file of SEs learned with drawn hyperparameters")
+    fixed: str | None = setting(None, help="file of SEs learned with one agent's; quick: cartpole")
+    real_groups: int | None = count(
+        None, help="Groups of agents on the real task, which is slow; as many as SEs."
+    )
+    real_episodes: int | None = count(
+        None, quick=100, help="On the real task; 1000 (discrete TD3 in Acrobot 500)."
+    )
 
 
 def compute(settings: SePerformance) -> pd.DataFrame:

@@ -61,8 +61,8 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 class Timings(Settings):
     name = "timings"
 
-    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS))  # tasks and proxies
-    generations: int = count(2)  # outer iterations to time
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), help="tasks and proxies")
+    generations: int = count(2, help="outer iterations to time")
 
 
 def compute(settings: Timings) -> pd.DataFrame:

@@ -38,21 +38,23 @@ NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result dep
 _SAME = object()
 
 
-def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> Any:
-    """A field of `Settings`. The comment beside it is its help text.
+def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME, help: str = "") -> Any:
+    """A field of `Settings`.
 
     Args:
       default: its default; None where it may be left open.
       rule: what must hold, as in `sejax.options`.
       quick: its default with `quick=true`.
+      help: what `--help` says of it.
     """
     metadata = {"rule": rule, "quick": default if quick is _SAME else quick}
+    metadata |= {"help": help} if help else {}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
+def count(default: int | None, least: int = 1, *, quick: Any = _SAME, help: str = "") -> Any:
     """A field that counts something, `least` of them at least."""
-    return setting(default, counts("nothing is computed otherwise", least), quick=quick)
+    return setting(default, counts("nothing is computed otherwise", least), quick=quick, help=help)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,14 +67,16 @@ class Settings(Options):
 
     name: ClassVar[str]  # of the experiment's module
 
-    quick: bool = setting(False)  # a small version, in minutes
-    from_rows: bool = setting(False)  # make table and figures again from the stored rows
-    # Folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick.
-    out: str | None = setting(None)
-    # Folder of what is not kept; runs/experiments/... for results/..., or out/work.
-    work: str | None = setting(None)
-    seed: int = setting(0, options.seed())  # first seed
-    devices: int | None = count(None)  # to use; all
+    quick: bool = setting(False, help="a small version, in minutes")
+    from_rows: bool = setting(False, help="make table and figures again from the stored rows")
+    out: str | None = setting(
+        None, help="Folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick."
+    )
+    work: str | None = setting(
+        None, help="Folder of what is not kept; runs/experiments/... for results/..., or out/work."
+    )
+    seed: int = setting(0, options.seed(), help="first seed")
+    devices: int | None = count(None, help="to use; all")
 
     def __post_init__(self) -> None:
         super().__post_init__()

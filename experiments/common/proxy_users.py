@@ -49,19 +49,28 @@ GRID_POINTS = 60
 class BreakEven(Settings):
     name = "break_even"
 
-    # Proxies that ship with sejax.
     proxies: tuple[str, ...] = setting(
-        tuple(pretrained_names()), each_of(pretrained_names()), quick=("cliff_walking-rn",)
+        tuple(pretrained_names()),
+        each_of(pretrained_names()),
+        quick=("cliff_walking-rn",),
+        help="Proxies that ship with sejax.",
     )
-    # Agents of each sort, in five groups; 100, on HalfCheetah 20.
-    num_agents: int | None = count(None, NUM_GROUPS, quick=10)
-    # Of each kind that may be the fastest, and of learning curves; 20, on HalfCheetah 5.
-    num_pilots: int | None = count(None, quick=2)
-    max_steps: int | None = count(None, quick=3000)  # of an agent with real steps; by the task
-    test_episodes: int = count(10)  # of each agent
-    nulls: str = setting("results/null_baselines")  # folder of their rows, by task
-    pilot_seed: int = setting(500, options.seed())  # first seed of the pilots
-    seed: int = setting(1000, options.seed())  # first seed of all others
+    num_agents: int | None = count(
+        None,
+        NUM_GROUPS,
+        quick=10,
+        help="Agents of each sort, in five groups; 100, on HalfCheetah 20.",
+    )
+    num_pilots: int | None = count(
+        None,
+        quick=2,
+        help="Of each kind that may be the fastest, and of learning curves; 20, on HalfCheetah 5.",
+    )
+    max_steps: int | None = count(None, quick=3000, help="of an agent with real steps; by the task")
+    test_episodes: int = count(10, help="of each agent")
+    nulls: str = setting("results/null_baselines", help="folder of their rows, by task")
+    pilot_seed: int = setting(500, options.seed(), help="first seed of the pilots")
+    seed: int = setting(1000, options.seed(), help="first seed of all others")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -168,12 +168,19 @@ def label(name: str) -> str:
 class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
-    # Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
-    env: str = setting("cliff_walking", one_of(STUDIES))
-    # Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.
-    variants: tuple[str, ...] = setting(VARIANTS)
-    learned: int = count(10)  # RNs to learn of each variant
-    rns_dir: str | None = setting(None)  # of RNs; results/reward_networks, quick: rns/ in `out`
+    env: str = setting(
+        "cliff_walking",
+        one_of(STUDIES),
+        help="Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.",
+    )
+    variants: tuple[str, ...] = setting(
+        VARIANTS,
+        help="Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.",
+    )
+    learned: int = count(10, help="RNs to learn of each variant")
+    rns_dir: str | None = setting(
+        None, help="of RNs; results/reward_networks, quick: rns/ in `out`"
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:

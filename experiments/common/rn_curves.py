@@ -45,18 +45,27 @@ GRID_POINTS = 200
 class CurveSettings(RnSettings):
     """Settings about the agents."""
 
-    # Agents to train: default (the paper's hyperparameters; on continuous tasks those of the quick
-    # agent that RNs are learned with), varied (drawn for each agent), transfer (one that the RNs
-    # never saw), tuned (on the real task for few steps: DDQN on cartpole, PPO on
-    # mountain_car_continuous).
-    rows: tuple[str, ...] = setting(PAPER_ROWS, each_of(ROWS))
-    # Exploration bonuses on the real task to compare with: count_based on cliff_walking, elsewhere
-    # icm; or none.
-    bonuses: tuple[str, ...] = setting(())
-    rns: int = count(10)  # RNs of each variant that agents are trained on, the best
-    bonus_groups: int = count(10)  # groups of agents with a bonus; as many as RNs
-    num_agents: int = count(10)  # on each RN, in each row
-    max_steps: int = count(5000)  # of training; as the paper's figure
+    rows: tuple[str, ...] = setting(
+        PAPER_ROWS,
+        each_of(ROWS),
+        help=(
+            "Agents to train: default (the paper's hyperparameters; on continuous tasks those of "
+            "the quick agent that RNs are learned with), varied (drawn for each agent), transfer "
+            "(one that the RNs never saw), tuned (on the real task for few steps: DDQN on "
+            "cartpole, PPO on mountain_car_continuous)."
+        ),
+    )
+    bonuses: tuple[str, ...] = setting(
+        (),
+        help=(
+            "Exploration bonuses on the real task to compare with: count_based on cliff_walking, "
+            "elsewhere icm; or none."
+        ),
+    )
+    rns: int = count(10, help="RNs of each variant that agents are trained on, the best")
+    bonus_groups: int = count(10, help="groups of agents with a bonus; as many as RNs")
+    num_agents: int = count(10, help="on each RN, in each row")
+    max_steps: int = count(5000, help="of training; as the paper's figure")
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:

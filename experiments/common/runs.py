@@ -39,10 +39,10 @@ QUICK = (
 class RunSettings(Settings):
     """Settings about the NES runs."""
 
-    env: str = setting("cartpole")  # task: cartpole, acrobot, ...
-    generations: int | None = count(None)  # outer iterations; the preset's
-    preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
-    run: tuple[str, ...] = setting(())  # overrides of the NES runs, or as below
+    env: str = setting("cartpole", help="task: cartpole, acrobot, ...")
+    generations: int | None = count(None, help="outer iterations; the preset's")
+    preset: str = setting("best", help="of the NES runs: best, paper, for SEs paper_performance")
+    run: tuple[str, ...] = setting((), help="overrides of the NES runs, or as below")
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""
