@@ -240,7 +240,7 @@ class Example(experiment.Settings):
 
     env: str = experiment.setting("cartpole")
     agents: tuple[str, ...] = experiment.setting(("ddqn", "ppo"), each_of(("ddqn", "ppo")))
-    num_agents: int = experiment.count(10, quick=4)  # of each
+    num_agents: int = experiment.count(10, quick=4, help="of each")
     run: tuple[str, ...] = experiment.setting(())
 
 
