@@ -27,7 +27,7 @@ from experiments.common.tables import publish
 class RnPerformance(CurveSettings):
     name = "rn_performance"
 
-    objective: str = option(reward_networks.objective_setting(), help="that RNs are learned by")
+    objective: str = reward_networks.objective_setting()
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:

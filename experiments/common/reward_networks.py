@@ -220,7 +220,7 @@ class RnSettings(RunSettings):
 
 def objective_setting() -> Any:
     """The setting of experiments that use the RNs of one objective."""
-    return setting("reward_threshold", one_of(OBJECTIVES))
+    return setting("reward_threshold", one_of(OBJECTIVES), help="that RNs are learned by")
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
