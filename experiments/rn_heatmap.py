@@ -48,7 +48,7 @@ _CORNERS = {
 class RnHeatmap(RnSettings):
     name = "rn_heatmap"
 
-    objective: str = rn.objective_setting()  # that RNs are learned by
+    objective: str = rn.objective_setting()
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -27,7 +27,7 @@ from experiments.common.tables import publish
 class RnPerformance(CurveSettings):
     name = "rn_performance"
 
-    objective: str = reward_networks.objective_setting()  # that RNs are learned by
+    objective: str = reward_networks.objective_setting()
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:

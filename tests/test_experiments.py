@@ -200,11 +200,17 @@ def test_commands_in_the_docs_are_accepted():
 
 @dataclass(frozen=True, kw_only=True)
 class Example(experiment.Settings):
+    """What it computes.
+
+    Attributes:
+      num_agents: of each
+    """
+
     name = "example"
 
     env: str = experiment.setting("cartpole")
     agents: tuple[str, ...] = experiment.setting(("ddqn", "ppo"), each_of(("ddqn", "ppo")))
-    num_agents: int = experiment.count(10, quick=4)  # of each
+    num_agents: int = experiment.count(10, quick=4)
     run: tuple[str, ...] = experiment.setting(())
 
 

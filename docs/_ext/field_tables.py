@@ -57,7 +57,7 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
 
 
 def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:
-    """Adds the table to options, and to a dataclass whose docstring does not list its attributes."""
+    """Adds the table to options, and to a dataclass whose docstring lists no attributes."""
     if what != "class" or not dataclasses.is_dataclass(cls):
         return
     if "Attributes:" in lines:

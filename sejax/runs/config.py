@@ -392,7 +392,7 @@ def _from_plain(
     for name in objects.keys() - fields.keys():
         parts = {k: x for k, x in objects.items() if k in fields and k != "agents"}
         parts |= {field_of(key, of_agents): x for key, x in objects["agents"].items()}
-        raise unknown_field(name, [*fields, *flatten(to_plain(parts))])
+        raise unknown_field(str(name), [*fields, *flatten(to_plain(parts))])
     return from_plain(schema, objects, "", imports)
 
 
