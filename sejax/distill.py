@@ -201,7 +201,6 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     plain = configuration.plain(config)
-    spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
     path = folder / "proxy.safetensors"
     save(
         path,
@@ -212,20 +211,10 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
         seed=config.seed,
         policy_return=lessons[best].policy_return,
         evaluations=evaluations_of(tested),
-        learning={
-            "command": f"python -m sejax.distill {words}".rstrip(),
-            "generations": own.search.generations if own.policy is None else 0,
-            "real_steps": int(spent["real_steps"]),
-            "agents": len(rows),
-            "train_steps": int(rows["train_steps"].sum()),
-            "cpu_s": round(float(spent["cpu_s"]), 1),
-        },
+        learning=learning_of(own, words, costs, rows),
     )
     write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
-    print(
-        f"{path} holds the SE of generation {lessons[best].generation}: "
-        f"{spent['real_steps']:,.0f} real steps, {spent['cpu_s']:,.0f} CPU s."
-    )
+    print(f"{path} holds the SE of generation {lessons[best].generation}.")
     return path
 
 
@@ -233,6 +222,21 @@ def asked(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
     """What the numbers depend on, as plain values."""
     plain = configuration.plain(config)
     return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
+
+
+def learning_of(
+    own: DistillConfig, words: str, costs: pd.DataFrame, rows: pd.DataFrame
+) -> dict[str, Any]:
+    """What the SE cost, its students included, as its file keeps it."""
+    spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
+    return {
+        "command": f"python -m sejax.distill {words}".rstrip(),
+        "generations": own.search.generations if own.policy is None else 0,
+        "real_steps": int(spent["real_steps"]),
+        "agents": len(rows),
+        "train_steps": int(rows["train_steps"].sum()),
+        "cpu_s": round(float(spent["cpu_s"]), 1),
+    }
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:

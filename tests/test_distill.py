@@ -137,7 +137,7 @@ def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
         ("env=cliff_walking", "agent"),
         ("policy=sax", "policy"),
         ("policy=nothing:act", "policy"),
-        ("policy=td3", "agent"),
+        ("policy=td3", "policy"),
         (f"policy={__name__}:SIGN", "policy"),
         (f"policy={__name__}:of_another_shape", "policy"),
         (f"policy={__name__}:out_of_range", "policy"),

@@ -135,7 +135,10 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     """A fresh agent with its default hyperparameters, trained on the real task."""
-    agent = make_agent(registry.configure("agent", {"name": name}), task)
+    try:
+        agent = make_agent(registry.configure("agent", {"name": name}), task)
+    except ConfigError as error:  # it does not fit the task
+        raise ConfigError(str(error).replace("agent", "policy"), "policy") from error
     training = TrainingConfig(
         max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
     )
