@@ -46,6 +46,12 @@ _CORNERS = {
 
 @dataclass(frozen=True, kw_only=True)
 class RnHeatmap(RnSettings):
+    """Settings of this experiment.
+
+    Attributes:
+      objective: that RNs are learned by
+    """
+
     name = "rn_heatmap"
 
     objective: str = rn.objective_setting()

@@ -25,6 +25,12 @@ from experiments.common.tables import publish
 
 @dataclass(frozen=True, kw_only=True)
 class RnPerformance(CurveSettings):
+    """Settings of this experiment.
+
+    Attributes:
+      objective: that RNs are learned by
+    """
+
     name = "rn_performance"
 
     objective: str = reward_networks.objective_setting()
