@@ -72,5 +72,3 @@ def test_an_objective_of_ones_own_has_no_score_for_what_diverged_either():
     objective = Objective(score=lambda outcome: -outcome.train_episodes.astype(jnp.float32))
     got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
     np.testing.assert_array_equal(got, [np.nan, -1.0])
-
-
