@@ -15,6 +15,7 @@ from support import metrics, printed, refused
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
+from sejax.ops.files import write_text  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
 from sejax.run import learn_all  # noqa: E402
 from sejax.runs import config as configuration  # noqa: E402
@@ -48,7 +49,7 @@ class Learning:
             for generation in range(int(done.read_text()) if done.exists() else 0, generations):
                 self.meanwhile(folder.name, generation)
                 self.ran.append((folder.name, generation))
-                done.write_text(str(generation + 1))
+                write_text(done, str(generation + 1))
             scores = [self.score(config, i) for i in range(1, generations + 1)]
             return trials.Progress(
                 scores=np.array(scores),
@@ -157,6 +158,30 @@ def test_an_interrupted_trial_goes_on_from_its_files(tmp_path, learning, error):
     assert drawn(found) == drawn(undisturbed)
     reported = [[x.intermediate_values for x in each.trials] for each in (found, undisturbed)]
     assert reported[0] == reported[1]
+
+
+def test_a_trial_that_was_killed_as_it_was_pruned_is_pruned_again(tmp_path, learning, monkeypatch):
+    words = "trials=10", "min_generations=1", "max_generations=3"
+    undisturbed, search = opened(tmp_path / "a", *words)
+    study.work(undisturbed, search)
+    found, search = opened(tmp_path / "b", *words)
+
+    asked = optuna.trial.Trial.should_prune
+    killed = []
+
+    def kill_once(trial):
+        answer = asked(trial)
+        if trial.number not in killed:
+            killed.append(trial.number)
+            raise KeyboardInterrupt
+        return answer
+
+    monkeypatch.setattr(optuna.trial.Trial, "should_prune", kill_once)
+    for _ in range(10):
+        with pytest.raises(KeyboardInterrupt):
+            study.work(found, search)
+    study.work(found, search)
+    assert states(found) == states(undisturbed) and drawn(found) == drawn(undisturbed)
 
 
 def test_a_trial_that_fails_each_time_is_given_up(tmp_path, learning):

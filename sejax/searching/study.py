@@ -135,18 +135,34 @@ def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) ->
     if not any(trial.state == TrialState.WAITING for trial in known):
         # Drawn at once: whoever is killed meanwhile leaves no half of it, and draws the same again.
         seed = np.random.SeedSequence([search.plain["seed"], len(known)]).generate_state(1)[0]
-        sampler = optuna.samplers.TPESampler(seed=int(seed))
-        draft = optuna.create_study(
-            study_name=study.study_name,
-            sampler=sampler,
-            pruner=study.pruner,
-            direction="maximize",
-        )
-        draft.add_trials(known)
+        draft = _copy(study)
+        draft.sampler = optuna.samplers.TPESampler(seed=int(seed))
         study.enqueue_trial(draft.ask(space).params)
     trial = study.ask(space)
     held.enter_context(_lock(search, _name(trial.number)))
     return trial
+
+
+def _copy(study: optuna.Study) -> optuna.Study:
+    """A copy in memory, where trying leaves nothing."""
+    copy = optuna.create_study(
+        study_name=study.study_name, pruner=study.pruner, direction="maximize"
+    )
+    copy.add_trials(study.get_trials(deepcopy=False))
+    return copy
+
+
+def _is_behind(trial: Trial, rung: int) -> bool:
+    """Whether a trial is pruned at a rung.
+
+    The answer is kept before Optuna hears that the trial has come so far: it answers once.
+    """
+    study, name = trial.study, f"pruned_at_{rung}"
+    if name not in trial.user_attrs:
+        copy = _copy(study)
+        trial.set_user_attr(name, study.pruner.prune(copy, copy.trials[trial.number]))
+    trial.should_prune()
+    return bool(trial.user_attrs[name])
 
 
 def _computed(trial: Trial, search: Search) -> str:
@@ -167,7 +183,7 @@ def _computed(trial: Trial, search: Search) -> str:
         for step in range(num_reported + 1, rung + 1):
             trial.report(float(progress.scores[step - 1]), step)
         num_reported = rung
-        if rung < last and not progress.is_over and trial.should_prune():
+        if rung < last and not progress.is_over and _is_behind(trial, rung):
             break
     trial.set_user_attr("generations", progress.generations)
     trial.set_user_attr("train_steps", progress.train_steps)
