@@ -1,6 +1,6 @@
 """Algorithm 1 in one file: a network learns to be a world that teaches CartPole.
 
-    python algorithm1.py    # a minute of one CPU core; --seed=1 is another run
+    python algorithm1.py --seed=0    # a minute of one CPU core; seeds 0 to 4 end at 185 to 200
 
 A synthetic environment (SE) is a network with weights psi. New agents are trained on it alone; an
 evolution strategy (NES) moves psi to where they score well on CartPole. Nothing of sejax is

@@ -127,7 +127,7 @@ def test_algorithm_1_learns_an_se_whose_agents_solve_cartpole(tmp_path):
     compiled_in_full = os.environ | {"XLA_FLAGS": ""}
     said = printed(sys.executable, EXAMPLES / "algorithm1.py", cwd=tmp_path, env=compiled_in_full)
     returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
-    assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 190
+    assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 170
 
 
 # --- own_agent -----------------------------------------------------------------------------------

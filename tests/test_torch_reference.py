@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import paper_se
+from support import paper_se, random_columns
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, make_ddqn
@@ -39,13 +39,8 @@ def test_updates_equal_sejaxs_on_the_same_batches():
     torch_state = reference.ddqn_state(torch_network(state.params))
     rng = np.random.default_rng(0)
     for _ in range(2):
-        batch = Transition(
-            obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
-            action=jnp.int32(rng.integers(0, NUM_ACTIONS, BATCH)),
-            reward=jnp.float32(rng.normal(size=BATCH)),
-            discount=jnp.float32(rng.uniform(-0.2, 1.2, BATCH)),
-            next_obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
-        )
+        columns = random_columns(rng, OBS_DIM, BATCH)
+        batch = Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
         state = update(jax.random.key(0), state, batch)
         reference.ddqn_update(torch_state, reference.batch_from_sejax(batch), CONFIG)
     networks = (state.params, torch_state.online.values), (state.target_params, torch_state.target)
