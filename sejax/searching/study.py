@@ -29,6 +29,8 @@ from sejax.searching.trials import Progress
 STORED = "sejax"  # the study's attribute that holds what is searched
 ATTEMPTS = 10  # at a trial whose workers are lost
 LONGEST_WAIT_S = 3600  # for another worker's write to the database
+UNUSABLE: tuple[type[Exception], ...] = (optuna.exceptions.OptunaError, SQLAlchemyError)
+DAMAGED = (*UNUSABLE, KeyError, TypeError, ValueError)  # also of what a database holds
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 ATTRIBUTES = ("number", "state", "value", "user_attrs")  # of a trial, in tables
 SHOWN = 10
@@ -36,17 +38,17 @@ HOW = ("seed", "devices", "num_parallel", "tracker")  # fields of how trials ran
 
 
 @contextlib.contextmanager
-def usable(search: Search, *more: type[Exception]) -> Iterator[None]:
+def usable(search: Search, errors: tuple[type[Exception], ...] = UNUSABLE) -> Iterator[None]:
     """Within it, trouble with the database is told in one line.
 
     Raises:
-      ConfigError: in the place of Optuna's errors and its database's, and of `more`.
+      ConfigError: in the place of these errors.
     """
     try:
         yield
     except ConfigError:
         raise
-    except (optuna.exceptions.OptunaError, SQLAlchemyError, *more) as error:  # type: ignore[misc]
+    except errors as error:
         raise ConfigError(
             f"search_dir must hold a database that can be used; got {search.folder / 'study.db'} "
             f"({told(error.__cause__ or error)}). Set search_dir=FOLDER.",
@@ -65,7 +67,7 @@ def open_study(search: Search) -> optuna.Study:
     config, current = search.config, search.current()
     require_writable("search_dir", search.folder)
     (search.folder / "trials").mkdir(parents=True, exist_ok=True)
-    with _lock(search, "study"), usable(search, KeyError, TypeError, ValueError):
+    with _lock(search, "study"), usable(search, DAMAGED):
         study = optuna.create_study(
             study_name=search.study,
             storage=optuna.storages.RDBStorage(
