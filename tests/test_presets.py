@@ -252,3 +252,10 @@ def test_a_task_without_a_file_has_general_settings(proxy):
         )
     with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best"):
         sejax.config(["env=gymnax/MountainCar-v0", f"proxy={proxy}", "preset=paper"])
+
+
+@pytest.mark.parametrize(("env", "steps"), [("mountain_car", 2000), ("halfcheetah", 200)])
+def test_settings_of_an_objective_hold_for_that_objective(env, steps):
+    for _ in range(2):  # which leaves the preset as it is
+        assert sejax.config([f"env={env}"]).objective.first_eval_steps == steps
+    assert not hasattr(sejax.config([f"env={env}", "objective=auc"]).objective, "first_eval_steps")

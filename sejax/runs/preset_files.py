@@ -103,8 +103,10 @@ def settings_of(
     layers = [{k: x for k, x in section.items() if not k.startswith("with_")}]
     layers += [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
     layers += settings.values() if len(agents) == 1 else []
-    shared = {k: x for k, x in merge(*layers).items() if k not in ("agent", "objective")}
-    return shared | {"agents": {key: each.get("agent", {}) for key, each in settings.items()}}
+    shared = {k: x for k, x in merge(*layers).items() if k != "agent"}
+    objective = {k: x for k, x in shared.get("objective", {}).items() if k != "name"}  # chosen
+    of_agents = {key: each.get("agent", {}) for key, each in settings.items()}
+    return shared | {"objective": objective, "agents": of_agents}
 
 
 def read_file(path: Path) -> dict[str, Any]:
