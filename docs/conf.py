@@ -70,9 +70,9 @@ nitpick_ignore_regex = [
     # Type variables, and what only signatures name.
     (
         "py:class",
-        r"sejax\.(agents\.(base\.T|buffers\.State)|proxies\.configs\.Vector|envs\.environment\.(State|Params))",
+        r"sejax\.(agents\.(base\.T|buffers\.State)|es\.base\.T|proxies\.synthetic\.Vector|envs\.environment\.(State|Params))",
     ),
-    ("py:class", r"sejax\.(bilevel\.RunConfig|ops\.networks\.MLP)"),
+    ("py:class", r"sejax\.(options\.parts\.(Makes|RunConfig)|scoring\.Scoring|ops\.networks\.MLP)"),
 ]
 
 # --- HTML ----------------------------------------------------------------------------------------

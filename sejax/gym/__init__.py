@@ -3,8 +3,8 @@
 `make` makes an environment of a synthetic environment (SE) or a reward network (RN), `make_vec` and
 `make_sb3` vector environments, and `RewardNetwork` puts an RN around an environment that you have.
 Importing this registers what ships with the package, as `sejax/<name>`; Gymnasium imports it for
-`sejax.gym:sejax/<name>`, in other processes too. Neither JAX nor gymnax is loaded, so that
-environments fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`. How to use it
+`sejax.gym:sejax/<name>`, in other processes too. No backend of JAX starts, so that environments
+fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`. How to use it
 all: docs/gymnasium.md.
 
 Example:
