@@ -112,9 +112,12 @@ class SyntheticWorld:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
         if isinstance(self.action_space, spaces.Discrete):
-            array = np.asarray(action) if space.shape else action
-            if space.contains(array):  # also of bools, which would be a mask
-                return self._one_hot[array.astype(np.intp) if space.shape else int(array)]
+            if not space.shape and space.contains(action):
+                return self._one_hot[int(action)]
+            array = np.asarray(action)  # also of bools, which would be a mask
+            is_whole = array.shape == space.shape and array.dtype.kind in "biu"
+            if space.shape and is_whole and space.contains(array):
+                return self._one_hot[array.astype(np.intp)]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
