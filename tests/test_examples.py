@@ -18,6 +18,7 @@ from sejax.agents import sac
 from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+SLOW = ("own_objective", "suite_reward_network")
 TINY = {
     "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],
@@ -78,8 +79,8 @@ def test_every_example_is_tested():
 def _marked(name):
     """An example with its marks: warnings of another package are its own."""
     own = [pytest.mark.filterwarnings("default")] if name in NEEDS else []
-    # The dearest, whose objective a command uses below.
-    return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (name == "own_objective")])
+    # The dearest; the objective of one is used by a command below.
+    return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (name in SLOW)])
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in TINY])

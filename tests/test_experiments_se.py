@@ -49,6 +49,7 @@ def test_a_run_that_did_not_solve_the_task_took_more_steps_than_all(solved, text
     assert table["sejax"][row].item() == text
 
 
+@pytest.mark.slow
 def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     def learned(**given):
         run("se_feasibility", se_feasibility, tmp_path, **given)

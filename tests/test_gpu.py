@@ -20,6 +20,7 @@ def gpu(monkeypatch):
     return gpu
 
 
+@pytest.mark.slow
 def test_the_command_measures_and_writes_its_result(tmp_path):
     path = tmp_path / "gpu.json"
     said = printed(sys.executable, BENCHMARKS / "gpu.py", "--quick", "--json", path)

@@ -160,6 +160,7 @@ def test_an_interrupted_trial_goes_on_from_its_files(tmp_path, learning, error):
     assert reported[0] == reported[1]
 
 
+@pytest.mark.slow
 def test_a_trial_that_was_killed_as_it_was_pruned_is_pruned_again(tmp_path, learning, monkeypatch):
     words = "trials=10", "min_generations=1", "max_generations=3"
     undisturbed, search = opened(tmp_path / "a", *words)
