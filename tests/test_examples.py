@@ -18,7 +18,7 @@ from sejax.agents import sac
 from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SLOW = ("own_objective", "suite_reward_network")
+SLOW = ("own_objective", "read_a_set", "suite_reward_network")
 TINY = {
     "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],

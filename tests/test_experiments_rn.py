@@ -74,6 +74,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
         pd.testing.assert_frame_equal(without, expected)
 
 
+@pytest.mark.slow
 def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch):
     settings = options(RnPerformance)
     three = rn.learn(settings, "additive_potential", "reward_threshold")

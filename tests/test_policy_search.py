@@ -81,6 +81,7 @@ def test_the_step_size_declines_in_the_second_half():
     np.testing.assert_allclose(sizes, [0.5, 0.5, 0.25, 0.05], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_search_solves_cartpole_and_takes_bonuses_out():
     search = make_search(dataclasses.replace(SMALL, num_directions=16), CARTPOLE)
     generation, policy = jax.jit(search.generation), search.init()
@@ -137,6 +138,7 @@ def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most):
     assert len(lesson.states) < costs["real_steps"].item() <= 5 * 4 * task.max_steps
 
 
+@pytest.mark.slow
 def test_an_agent_is_trained_on_the_task_and_copied():
     (lesson,), costs = copied(COPY, CARTPOLE, "ddqn", KEYS)
     assert costs["real_steps"].item() > COPY.agent_steps + len(lesson.states)
