@@ -1,4 +1,4 @@
-"""Stored proxies for Gymnasium and Stable-Baselines3, in NumPy alone: any agent, no JAX.
+"""Stored proxies for Gymnasium and Stable-Baselines3, in NumPy: any agent.
 
 `make` makes an environment of a synthetic environment (SE) or a reward network (RN), `make_vec` and
 `make_sb3` vector environments, and `RewardNetwork` puts an RN around an environment that you have.

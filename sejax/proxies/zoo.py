@@ -231,7 +231,7 @@ def card_of(
     arguments = "".join(f", {header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
     call = f'("{source}"{arguments})'
-    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
+    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent\n"
     values = {
         "name": proxy.name,
         "about": _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind),
