@@ -81,7 +81,7 @@ def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    return settings.shards.compute(f"seed{seed}", distill.asked(own, config), run)
+    return settings.shards.compute(f"seed{seed}", distill.settings_of(own, config), run)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:

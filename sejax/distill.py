@@ -171,7 +171,7 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       ConfigError: for a folder of another command, or a policy that cannot be.
       OSError: if a file cannot be written.
     """
-    with Store(folder, asked(own, config)) as store:
+    with Store(folder, settings_of(own, config)) as store:
         return _distilled(own, config, store, words)
 
 
@@ -187,8 +187,8 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     else:
         lessons, costs = copied(own.copy, task, own.policy, keys)
     store.put(CHECKPOINT)
-    made = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
-    env, weights = made[0][0], [weights for _, weights in made]
+    ses = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
+    env, weights = ses[0][0], [weights for _, weights in ses]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
         own_keys = jax.random.split(keys[CHOOSE], own.num_students)
@@ -218,7 +218,7 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     return path
 
 
-def asked(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+def settings_of(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
     """What the numbers depend on, as plain values."""
     plain = configuration.plain(config)
     return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
