@@ -60,5 +60,5 @@ def test_cliff_walking_rns_teach_faster_than_the_real_reward():
         outcome = sejax.evaluate_agents(agent, env, params, task, config.training, keys)
         steps.append(outcome.train_steps.mean())
         assert not outcome.nonfinite.any() and (outcome.test_return > -30).all()
-    assert 1400 < steps[1] < 1600  # as the real reward's in docs/results.md
+    assert 1400 < steps[1] < 1600  # as the real reward's in docs/studies/rn_performance.md
     assert steps[0] < 0.8 * steps[1]

@@ -65,7 +65,7 @@ class RewardConfig(ProxyConfig):
 
     Attributes:
       output_scale: Phi is this times the network's output. Some agents learn only from small
-        rewards (docs/results.md, MountainCarContinuous).
+        rewards (docs/studies/rn_performance.md, MountainCarContinuous).
       augmented: the network sees the task's vector v as well
       zero_at_terminal: Phi is 0 where episodes end for the agent; see RewardEnv
     """

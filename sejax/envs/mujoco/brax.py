@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sejax.envs.mujoco.tasks import HalfCheetah
 
 # Of mjx's line search, where MuJoCo has 50: under vmap all wait for the longest search. With 10
-# gaits are worth as much as with 50, with 8 no longer (docs/halfcheetah.md).
+# gaits are worth as much as with 50, with 8 no longer (docs/mujoco.md).
 LS_ITERATIONS = 10
 
 

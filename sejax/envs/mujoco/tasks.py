@@ -18,7 +18,7 @@ from sejax.envs.spec import Box, TaskSpec
 from sejax.options import ConfigError, Options, finite, not_negative, one_of, option
 
 # Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
-# MuJoCo, at ten times its cost on a CPU (docs/halfcheetah.md).
+# MuJoCo, at ten times its cost on a CPU (docs/mujoco.md).
 BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
 
 # The entries of `info` that describe the state alone; an observation has no position along x or y.
