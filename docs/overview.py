@@ -31,7 +31,7 @@ def draw_loops(axes: Axes) -> None:
     patches = {}
     for name, (x, y, text) in BOXES.items():
         color = BLUE if name in ("se", "agent") else "#444444"
-        label = axes.text(x, y, text, ha="center", va="center", fontsize=9.5, color=color)
+        label = axes.text(x, y, text, ha="center", va="center", fontsize=9, color=color)
         label.set_bbox({"boxstyle": "round,pad=0.55", "facecolor": "white", "edgecolor": color})
         label.draw(axes.figure.canvas.get_renderer())
         patches[name] = label.get_bbox_patch()
@@ -70,7 +70,8 @@ def draw_agents(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-figure, (loops, agents) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+figure, (loops, agents) = plt.subplots(1, 2, figsize=(9.2, 3.7), layout="constrained")
+figure.get_layout_engine().set(wspace=0.08)
 draw_loops(loops)
 draw_agents(agents)
-figure.savefig(ROOT / "docs/overview.png", dpi=110)
+figure.savefig(ROOT / "docs/overview.png", dpi=130)
