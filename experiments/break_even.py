@@ -173,15 +173,15 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         {
             "proxy": row["proxy"],
             "real steps to learn it": tables.known_text(row["learning_steps"], ",.0f"),
-            "students": users_text(row, "student"),
+            "agents on it": users_text(row, "student"),
             "the same on the task": users_text(row, "same"),
             "tuned on the task": users_text(row, "tuned"),
-            "tuned students": users_text(row, "tuned_student"),
-            "agents until it pays": paid_text(row, "break_even"),
-            "beside the same": paid_text(row, "break_even_same"),
+            "tuned agents on it": users_text(row, "tuned_student"),
+            "agents until it breaks even": paid_text(row, "break_even"),
+            "compared with the same": paid_text(row, "break_even_same"),
             "by CPU seconds": paid_text(row, "break_even_cpu"),
-            "a bandit by hand": null_text(row, "by_hand"),
-            "a bandit of the best of four": null_text(row, "best_of_four"),
+            "an SE of a policy by hand": null_text(row, "by_hand"),
+            "an SE of the best of four": null_text(row, "best_of_four"),
         }
         for row in summary.to_dict("records")
     )
@@ -213,14 +213,14 @@ def report(settings: BreakEven, rows: pd.DataFrame) -> pd.DataFrame:
     most = summary["most_steps"].groupby(summary["task"]).first()
     limits = ", ".join(f"{name} {steps:,.0f}" for name, steps in most.items())
     note = (
-        "Agents: mean training steps until they are stopped, the share that reached the threshold; "
-        f"mean return after it (of the worst tenth). Limits: {limits}. Students of an SE train as "
+        "Agents: mean training steps until they are stopped, the share that solves the task; "
+        f"mean return after it (of the worst tenth). Limits: {limits}. Agents on an SE train as "
         "long as in learning, and take no real step. Tests count in learning the proxy, not in the "
         "agents' steps. In brackets Fieller's 95% interval over agents, of CPU seconds over five "
-        "groups of them; never: nothing is saved. Bandits: real steps to make one; return of its "
-        "students, of the same kind."
+        "groups of them; never: nothing is saved. SEs of policies: real steps of one; return of "
+        "agents on it, of the same algorithm."
     )
-    title = "From how many agents on a shipped proxy pays"
+    title = "After how many agents a shipped SE or RN breaks even"
     return tables.publish(settings, title, make_table(summary), summary, note)
 
 
@@ -253,11 +253,11 @@ def panel(axis: Any, row: Any, learned: pd.DataFrame) -> None:
     lowest = pd.DataFrame(held).mean().min()  # where any of them has a return
     how: dict[str, Any] = {"color": figures.FIXED, "ls": "", "ms": 7}
     cost = row.learning_steps
-    axis.plot(cost, row.student_return_mean, "o", label="students of the proxy", **how)
+    axis.plot(cost, row.student_return_mean, "o", label="agents on the SE or RN", **how)
     how["color"] = figures.BEST
     known = row.best_of_four_real_steps, row.best_of_four_test_return_mean
-    axis.plot(*known, "^", label="students of a bandit", **how)
-    figures.threshold(axis, row.target)
+    axis.plot(*known, "^", label="agents on the SE of a policy", **how)
+    figures.threshold(axis, row.target, label="score to reach")
     axis.set(xscale="log", xlabel="real steps", title=row.proxy)
     axis.set_ylim(bottom=lowest - 0.05 * (row.target - lowest))
 

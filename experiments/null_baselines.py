@@ -274,20 +274,20 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         first = mine.iloc[0]
         cells = {figures.agent_name(str(row.kind)): cell(row) for row in mine.itertuples()}
         costs = {
-            "proxy made of": label(source, teacher),
+            "SE of": label(source, teacher),
             "real steps": f"{first['real_steps']:,.0f}",
             "CPU s": f"{first['cpu_s']:,.2f}",
             "the policy itself": tables.known_text(first["policy_return"], ",.1f"),
-            "students": hparams,
+            "hyperparameters": hparams,
         }
         shown.append(costs | cells)
     table = pd.DataFrame(shown)
     budgets, most = settings.budgets, settings.budgets[-1]
     note = (
-        f"Cells: mean return of fresh agents after {most:,} steps on the proxy (mean of the worst "
+        f"Cells: mean return of fresh agents after {most:,} steps on the SE (mean of the worst "
         f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
-        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). Real steps "
-        "of making one proxy have tests in them, CPU seconds of bandits neither tests nor "
+        f"the median agent has solved it, of {', '.join(f'{x:,}' for x in budgets)}). Real steps "
+        "of making one SE have tests in them, CPU seconds of SEs of policies neither tests nor "
         "compilation. Costs of the best of four are those of all four."
     )
     title = f"What does as well as an SE on {settings.env}"
@@ -318,7 +318,11 @@ def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
             steps, returns = points["real_steps"].clip(lower=1), points["test_return_mean"]
             axes.plot(steps, returns, marker, label=label(source, teacher))
         figures.threshold(axes, settings.task.solved_reward)
-        axes.set(xscale="log", xlabel="real steps to make the proxy", ylabel="students' return")
+        axes.set(
+            xscale="log",
+            xlabel="real steps to make the SE",
+            ylabel="return of each algorithm on it",
+        )
         axes.legend(fontsize=7)
 
 

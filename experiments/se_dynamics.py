@@ -181,7 +181,7 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(curves, agents, task.solved_reward)
     draw(task, curves, settings.folder / "curves.png")
     columns: dict[str, Any] = {
-        "SE": lambda row: row.kind.replace("_", " "),
+        "SE": lambda row: name_of(row.kind),
         "steps of an episode": "{episode_steps:.1f}",
         "first solved": "{first_solved} of {runs}",
         "in generation": lambda row: tables.known_text(row.generations_to_solve, ",.0f") or "-",
@@ -200,13 +200,18 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summary.rename(columns=lambda name: name.replace(" ", "_"))
     note = (
         f"NES runs of {settings.generations} generations; costs (without compilation) until the "
-        f"first incumbent mean of at least {task.solved_reward:g}: medians over runs, - if half of "
+        f"first search mean of at least {task.solved_reward:g}: medians over runs, - if half of "
         f"them had none. The best SE of each run trains {settings.num_agents} fresh agents of each "
-        "kind, and of the learning kind with each discount, which also say which SEs solve the "
+        "algorithm, and of the learning one with each discount, which also say which SEs solve the "
         f"task: mean return. {tables.interval_note('SEs')} Verdicts as in se_myopia."
     )
-    title = f"SEs of {task.name} that may teach through their dynamics, beside a bandit"
+    title = f"SEs of {task.name} that may teach through their dynamics, and of one step"
     return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
+
+
+def name_of(kind: str) -> str:
+    """A kind of SE as people write it."""
+    return "one step" if kind == "bandit" else kind.replace("_", " ")
 
 
 def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
@@ -219,9 +224,9 @@ def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
             axis.remove()
         for axis, (kind, mine) in zip(axes.flat, kinds, strict=False):
             figures.runs(axis, mine, task.solved_reward)
-            axis.set_title(kind.replace("_", " "), fontsize=10)
+            axis.set_title(name_of(kind), fontsize=10)
         for axis in axes[:, 0]:
-            axis.set_ylabel("incumbent's mean return")
+            axis.set_ylabel("search mean, return")
 
 
 EXPERIMENT = Experiment(settings=SeDynamics, compute=compute, report=report, about=__doc__)

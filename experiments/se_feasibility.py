@@ -30,7 +30,7 @@ PAPER = {
     "runs": "40",
     "generations run": "200",
     "population": "16",
-    "generations to the first passage": "often about 50",
+    "generations until then": "often about 50",
 }
 
 
@@ -91,12 +91,12 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "runs": str(len(summary)),
         "generations run": f"{summary['generations'].max()}",
         "population": str(config.es.population_size),
-        "runs with a first passage": f"{np.isfinite(to_solve).sum()} of {len(summary)}",
-        "generations to the first passage": median_and_range(to_solve, config.generations),
-        "real steps to the first passage, median": f"{steps:,.0f}" if np.isfinite(steps) else more,
-        "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
-        "last incumbent mean": tables.mean_text("last", 1)(row),
-        "last incumbent mean, worst tenth": f"{worst_tenth(last):.1f}",
+        "runs that reach the solved score": f"{np.isfinite(to_solve).sum()} of {len(summary)}",
+        "generations until then": median_and_range(to_solve, config.generations),
+        "real steps until then, median": f"{steps:,.0f}" if np.isfinite(steps) else more,
+        "best search mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
+        "last search mean": tables.mean_text("last", 1)(row),
+        "last search mean, worst tenth": f"{worst_tenth(last):.1f}",
         "wall minutes of a run, mean": f"{summary['wall_min'].mean():.1f}",
     }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
@@ -110,12 +110,12 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     minutes = rows.groupby("seed", sort=False)["wall_s"].last() / 60
     summary = runs.summarise(rows, ["seed"], solved_reward).assign(wall_min=minutes.to_numpy())
     draw(rows, solved_reward, settings.folder / "learning_curves.png")
-    varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
+    varied = " with random hyperparameters" if config.agent_hparams == "varied" else ""
     note = (
-        f"Preset {config.preset}. An incumbent mean is over "
+        f"Preset {config.preset}. A search mean is over "
         f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
-        f"{config.training.test_episodes} test episodes each; the first passage is the first that "
-        f"reaches {solved_reward:g}. Median and range over runs. {tables.interval_note('runs')} "
+        f"{config.training.test_episodes} test episodes each, the solved score "
+        f"{solved_reward:g}. Median and range over runs. {tables.interval_note('runs')} "
         "The best is a maximum of noisy means and hence too high: se_performance tests the stored "
         f"SEs with other agents.{tables.WORST_NOTE}"
     )
@@ -130,7 +130,7 @@ def draw(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
     """
     with figures.panels(path, 1, 1, (6, 3.6)) as (_, [[axis]]):
         figures.runs(axis, curves, solved_reward)
-        axis.set_ylabel("mean return of the incumbent's\nagents on the real task")
+        axis.set_ylabel("search mean: return of agents\non the real task")
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(fontsize=9, loc="best")
 

@@ -253,7 +253,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(agents, task.solved_reward)
     draw(task, agents, settings.folder / "performance.png")
     note = (
-        f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
+        f"Mean ± std over agents with random hyperparameters, {len(return_columns(rows))} test "
         f"episodes each. {tables.interval_note('what its column names')} "
         '"Fewer" are training steps saved against the real task. '
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their agents and "

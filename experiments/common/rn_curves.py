@@ -23,8 +23,8 @@ from sejax.options import each_of, registry, require
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
     "default": "default hyperparameters",
-    "varied": "varied hyperparameters",
-    "transfer": "unseen agent",
+    "varied": "random hyperparameters",
+    "transfer": "held-out algorithm",
     "tuned": "tuned for few steps",
 }
 WITHOUT_RN = ("real", "count_based", "icm")  # conditions whose groups have nothing in common
@@ -202,7 +202,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
                 *((row.agents, "agents") if row.world in WITHOUT_RN else (row.groups, "RNs"))
             ),
             f"steps to solve, restricted to {most:,}": tables.mean_text("steps", 0),
-            "of the bare agent's": lambda row: tables.known_text(row.share_of_bare, ".0%"),
+            "share of those without an RN": lambda row: tables.known_text(row.share_of_bare, ".0%"),
             "solved": "{solved:.0%}",
             "mean return over training": tables.mean_text("return", 1),
             "worst tenth": "{return_worst_tenth:.1f}",
@@ -218,8 +218,8 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"up to {settings.max_steps:,} training steps or {settings.study.max_episodes:,} episodes, "
         "one greedy test episode after each. Steps to solve: restricted mean, until the mean of "
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
-        f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
-        "seeds. Curves that end early go on as the last test. "
+        f"does counts {settings.max_steps:,}. Those without an RN are of as many groups, "
+        "of the same seeds. Curves that end early go on as the last test. "
         f"{tables.interval_note('what its column names')}"
         f"{tables.WORST_NOTE}{'' if settings.study.agent else learned_with}"
     )
