@@ -35,7 +35,7 @@ START = functools.partial(commands.start, run.main, run.help_text, run.config_te
 @functools.cache
 def chunks(*words):
     """The compiled program of a configuration, which all runs of it share."""
-    return session.make_chunks(sejax.config([*TINY, *words]))
+    return workers.make_chunks(sejax.config([*TINY, *words]))
 
 
 class Report(Reporter):
@@ -52,7 +52,7 @@ def learn(path, *words, program=()):
     """A session of a run, as `sejax.run` has it; returns its messages."""
     config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
     report = Report()
-    with run_directory.open_for(config) as directory:
+    with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, chunks(*program), report)
     return "\n".join(report.said)
 
@@ -112,9 +112,9 @@ def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, monkey
 def test_seeds_run_one_after_the_other_on_one_executable(
     uninterrupted, tmp_path, monkeypatch, capsys
 ):
-    compiled, compile_ = [], session.Chunks.compile
+    compiled, compile_ = [], workers.Chunks.compile
     monkeypatch.setattr(
-        session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
+        workers.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
     )
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
     best = run.learn_all(run.configs_of([*TINY, *words]))
@@ -185,13 +185,13 @@ FAMILIES = ("agents=[sarsa,q_learning]",)
 
 @functools.cache
 def family_chunks():
-    return session.make_chunks(sejax.config([*OWN, *FAMILIES]))
+    return workers.make_chunks(sejax.config([*OWN, *FAMILIES]))
 
 
 def learn_families(path, *words):
     """A session of a run with two families; returns the line that is printed of its last chunk."""
     config = sejax.config([*OWN, *words, f"run_dir={path}"])
-    with run_directory.open_for(config) as directory, RunProgress(config) as report:
+    with run_directory.RunDirectory(config) as directory, RunProgress(config) as report:
         session.run(config, directory, family_chunks(), report)
 
 

@@ -20,7 +20,7 @@ from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.runs import commands
 from sejax.runs import config as configuration
-from sejax.runs.run_directory import columns_of
+from sejax.runs.run_directory import COLUMNS
 from sejax.searching import config as settings
 from sejax.searching import study
 
@@ -76,7 +76,7 @@ def write_run(path, config):
     path.mkdir()
     (path / "config.yaml").write_text(yaml.safe_dump(config))
     row = "0,0,1.0,0.0,0.0,1.0,1.0,20,20,2.0,0,10,0.5"
-    (path / "metrics.csv").write_text(f"{','.join(columns_of())}\n{row}\n")
+    (path / "metrics.csv").write_text(f"{','.join(COLUMNS)}\n{row}\n")
     return path
 
 
@@ -99,7 +99,7 @@ def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreig
     assert isinstance(refusal(configuration.learn_config, stored(**foreign)), sejax.ConfigError)
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
-    rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}
+    rows = {"metrics": np.frombuffer(f"{','.join(COLUMNS)}\n".encode(), np.uint8)}
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
     data = checksummed.pack(rows, "sejax_run", manifest)
     (path / "checkpoint.safetensors").write_bytes(data)

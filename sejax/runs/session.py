@@ -6,76 +6,25 @@ import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
 
-from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.ops.parallel import compiler_options
+from sejax.bilevel import Bilevel, LearnState
 from sejax.proxies.header import agents_of
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.runs.workers import Chunks
 from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
 PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
-
-
-class Chunks:
-    """The generations of a learner in chunks, each length compiled once, ahead of time.
-
-    `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
-    the chunk before returned it.
-
-    Attributes:
-      learner: the functions of Algorithm 1.
-      cpu_s: CPU seconds of other processes than this one.
-    """
-
-    cpu_s = 0.0
-
-    def __init__(self, learner: Bilevel):
-        self.learner = learner
-        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
-        self._compiled: dict[int, Any] = {}  # by the length
-
-    def is_ready(self, length: int) -> bool:
-        """Whether a chunk of this length has been compiled."""
-        return length in self._compiled
-
-    def compile(self, length: int) -> None:
-        """Compiles a chunk of this length."""
-
-        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-            step = self.learner.generation
-            return jax.lax.scan(lambda state, _: step(state), state, length=length)
-
-        state = jax.eval_shape(self.init, jax.random.key(0))
-        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[length] = jitted.lower(state).compile()
-
-    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations; the buffers of the state are donated.
-
-        Returns:
-          The state, and an info with leaves `[length, ...]`.
-        """
-        if not self.is_ready(length):
-            self.compile(length)
-        state, info = self._compiled[length](state)
-        return state, info
-
-
-def make_chunks(config: LearnConfig) -> Chunks:
-    """The generations of a configuration, for all runs that differ from it in the seed."""
-    return Chunks(make_bilevel(**config.parts()))
 
 
 def run(
@@ -128,14 +77,21 @@ def run(
                 draw(directory, learner)
                 drawn = time.monotonic()
         draw(directory, learner)
+    generations, agents = directory.finished_generations, learner.strategy.num_evaluations
+    steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
         solved_score=learner.solved_score,
         wall_s=round(start_wall_s + time.monotonic(), 1),
         cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
-        **_costs(directory, learner),
-        **_machine(),
+        generations=generations,
+        agents=generations * agents,
+        train_steps=round(steps * agents),
+        real_steps=directory.real_steps,
+        devices=[str(device) for device in jax.devices()],
+        machine=runtime.machine(),
+        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     )
     return ended
 
@@ -148,10 +104,9 @@ def _begin(
     restored = directory.restore(state)
     if restored is not None:
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
-        here = runtime.versions()
-        if directory.versions != here:
-            made = f"It was made with {directory.versions}; here are {here}"
-            report.say(f"{made}. Numbers may move.")
+        here, there = runtime.versions(), directory.versions
+        if there != here:
+            report.say(f"It was made with {there}; here are {here}. Numbers may move.")
         # `stop_when_solved` may have changed.
         solved = jax.numpy.bool_(chunks.learner.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
@@ -175,7 +130,7 @@ def _advance(
     chunks: Chunks, state: LearnState, length: int, report: Reporter
 ) -> tuple[LearnState, GenerationInfo]:
     """Runs `length` generations, and returns when they are computed."""
-    if not chunks.is_ready(length):
+    if length not in chunks.compiled:
         report.status("compiling")
         chunks.compile(length)
         report.status("first generation")
@@ -186,31 +141,9 @@ def _advance(
     return state, info
 
 
-def _costs(directory: RunDirectory, learner: Bilevel) -> dict[str, int]:
-    """What all sessions of a run took, as counts."""
-    agents = learner.strategy.num_evaluations  # of a generation
-    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
-    return {
-        "generations": directory.finished_generations,
-        "agents": directory.finished_generations * agents,
-        "train_steps": round(steps_of_agents * agents),
-        "real_steps": directory.real_steps,
-    }
-
-
-def _machine() -> dict[str, Any]:
-    """Where this session has computed, and with what."""
-    return {
-        "devices": [str(device) for device in jax.devices()],
-        "machine": runtime.machine(),
-        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
-    }
-
-
 def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
     """Whether there are generations, and every agent of each met a number that is not finite."""
-    agents = learner.strategy.num_evaluations
-    rows = directory.rows
+    rows, agents = directory.rows, learner.strategy.num_evaluations
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
@@ -221,14 +154,12 @@ def interrupts_held() -> Iterator[None]:
     Within, files are being written, and jax's caches call back from weak references, where Python
     prints an exception and forgets it: the run would go on.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    is_main = threading.current_thread() is threading.main_thread()  # others hear no signals
     heard: list[int] = []
     handlers = {
         number: signal.signal(number, lambda number, frame: heard.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
-        if callable(signal.getsignal(number))
+        if is_main and callable(signal.getsignal(number))
     }
     try:
         yield
