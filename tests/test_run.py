@@ -18,7 +18,7 @@ from support import metrics as rows
 
 import sejax
 from sejax import run
-from sejax.runs import commands, run_directory, runtime, session
+from sejax.runs import commands, run_directory, runtime, session, workers
 from sejax.runs import config as configuration
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
@@ -162,7 +162,7 @@ def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path
     (tmp_path / "my_tracker.py").write_text(TRACKER)
     monkeypatch.syspath_prepend(str(tmp_path))
     folder, word = tmp_path / "run", "tracker=my_tracker:make"
-    learn(folder, "generations=3", "checkpoint_every=3", word)
+    learn(folder, "generations=3", word)
     said = learn(folder, "generations=6", word, "tracker.fail_at=5")
     assert "tracker=my_tracker:make has failed" in said and "RuntimeError: out of paper" in said
     learn(folder, "generations=6", word)  # nothing is left to do: not even opened
@@ -278,6 +278,17 @@ def process(*words: str, flags: str | None = None) -> subprocess.CompletedProces
                           env=os.environ | cache | xla)  # fmt: skip
 
 
+def test_a_killed_run_goes_on_to_the_same_numbers(uninterrupted, tmp_path):
+    words = [*TINY, "generations=6", f"run_dir={tmp_path}"]
+    ended = process(sys.executable, "-c", DRIVER, "SIGKILL", *words)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert len(rows(tmp_path)) == 2
+    assert "Going on at generation 2" in learn(tmp_path, "generations=6")
+    assert_same(tmp_path, uninterrupted)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+
+
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_numbers_with_the_flags_that_users_have(tmp_path):
     words = [*TINY, "generations=4"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -314,13 +325,13 @@ def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, caps
 
 
 def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
-    def go(generations, stop):
-        learn(tmp_path, f"generations={generations}", program=(f"stop_when_solved={stop}",))
+    def go(generations, *program):
+        learn(tmp_path, f"generations={generations}", program=program)
         return json.loads((tmp_path / "run.json").read_text())["ended"]
 
-    assert go(6, "true") == "solved" and len(rows(tmp_path)) == 3
-    assert go(6, "false") == "finished" and rows(tmp_path) == rows(uninterrupted)
-    assert go(9, "true") == "solved" and rows(tmp_path) == rows(uninterrupted)
+    assert go(6, "stop_when_solved=true") == "solved" and len(rows(tmp_path)) == 3
+    assert go(6) == "finished" and rows(tmp_path) == rows(uninterrupted)
+    assert go(9, "stop_when_solved=true") == "solved" and rows(tmp_path) == rows(uninterrupted)
 
 
 def test_an_interrupt_waits_until_files_are_written():

@@ -21,8 +21,8 @@ from sejax.options import registry
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.run_directory import COLUMNS
+from sejax.runs.store import Store
 from sejax.searching import config as settings
-from sejax.searching import study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]
@@ -136,17 +136,19 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     assert (folder / "typed").exists()
 
 
-STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]
+STUDIES = [
+    {"env": SHELL},
+    {"env": {"name": IMPORTED}},
+    {"ranges": {"agent": f"choice(q_learning,{IMPORTED})"}},
+    {"run_dir": "victim"},
+]
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("stored", STUDIES, ids=range(len(STUDIES)))
 def test_a_study_is_compared_as_text(folder, refused, stored):
     words = [*TASK, SPACE, f"search_dir={folder / 'theirs'}"]
-    mine = settings.read(words)
-    theirs = mine.stored() | stored if isinstance(stored, dict) else stored
-    study.open_study(mine).set_user_attr(study.STORED, theirs)
-    assert "study must be" in refused(search_command, *words)
+    Store(folder / "theirs", settings.read(words).settings() | stored).put("search")
+    assert "search_dir must be" in refused(search_command, *words)
     assert not (folder / "victim").exists()
 
 
@@ -166,8 +168,6 @@ def write_proxy(config):
 def test_a_proxys_file_names_no_module(folder, refused, foreign):
     write_proxy(foreign)
     refused(evaluate_command, "proxy=evil.safetensors", "agent_hparams=as_learned", "out_dir=out")
-    if "agents" not in foreign:  # of which nothing is read there
-        refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 
 @pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"env", "proxy"} & {*x}])
