@@ -100,15 +100,9 @@ class RunDirectory(Store):
         """Generations that are saved."""
         return len(self.rows)
 
-    @property
-    def wall_s(self) -> float:
-        """Seconds of all sessions up to the checkpoint."""
-        return float(self.rows[-1]["wall_s"]) if self.rows else 0.0
-
-    @property
-    def real_steps(self) -> int:
-        """Steps on the real task up to the checkpoint."""
-        return int(self.rows[-1]["env_steps_total"]) if self.rows else 0
+    def last(self, column: str) -> str:
+        """The value in the last row that is saved; 0 without one."""
+        return self.rows[-1][column] if self.rows else "0"
 
     def restore(self, like: State) -> State | None:
         """The state of the checkpoint, and the files beside it remade; None for a new run.
@@ -184,7 +178,7 @@ class RunDirectory(Store):
             self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
             self.id, self.cpu_s = str(values["id"]), float(values["cpu_s"])
             self.versions = values.get("versions", self.versions)
-            _ = self.wall_s, self.real_steps
+            _ = float(self.last("wall_s")), int(self.last("env_steps_total"))
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = tensors
@@ -198,10 +192,10 @@ class RunDirectory(Store):
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a block."""
-        real_steps = np.asarray(info.real_steps, np.int64).sum(axis=1).cumsum() + self.real_steps
         others = {"seed", "env_steps_total", "wall_s"}
         values = {name: np.asarray(vars(info)[name]) for name in COLUMNS if name not in others}
-        values["env_steps_total"] = real_steps
+        steps = np.asarray(info.real_steps, np.int64).sum(axis=1)
+        values["env_steps_total"] = int(self.last("env_steps_total")) + steps.cumsum()
         for i, agent in enumerate(self._agents):
             for name in AGENT_COLUMNS:
                 values[f"{name}_{agent}"] = np.asarray(vars(info.by_agent)[name])[:, i]

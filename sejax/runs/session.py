@@ -50,9 +50,9 @@ def run(
       OSError: if a file cannot be written; everything saved before is whole.
     """
     report, learner = report or Reporter(), chunks.learner
-    start_wall_s = directory.wall_s - time.monotonic()
+    start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
-    state, best_on_disk = _begin(config, directory, chunks, report)
+    state = _begin(config, directory, chunks, report)
     tracked = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,
@@ -62,14 +62,15 @@ def run(
     drawn = time.monotonic()
     with contextlib.closing(GuardedTracker(config.tracker, tracked, report.say)) as tracker:
         while (ended := _ended(config, directory, learner, state)) is None:
-            left = config.generations - directory.finished_generations
-            state, info = _advance(chunks, state, min(config.checkpoint_every, left), report)
+            first = directory.finished_generations
+            length = min(config.checkpoint_every, config.generations - first)
+            state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
                 wall_s = start_wall_s + time.monotonic()
                 cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
                 rows = directory.save(saved, info, wall_s, cpu_s)
-                best_on_disk = save_proxies(directory, learner, saved, best_on_disk)
+                save_proxies(directory, learner, saved, first)
                 for generation in _finished(rows, info):
                     report.on_generation(generation)
                     tracker.on_generation(generation)
@@ -88,7 +89,7 @@ def run(
         generations=generations,
         agents=generations * agents,
         train_steps=round(steps * agents),
-        real_steps=directory.real_steps,
+        real_steps=int(directory.last("env_steps_total")),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
@@ -98,9 +99,9 @@ def run(
 
 def _begin(
     config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter
-) -> tuple[LearnState, int | None]:
-    """A new state or that of the folder, and the generation of the best proxy that is written."""
-    state, best_on_disk = chunks.init(jax.random.key(config.seed)), None
+) -> LearnState:
+    """A new state or that of the folder, beside which the proxies are written again."""
+    state = chunks.init(jax.random.key(config.seed))
     restored = directory.restore(state)
     if restored is not None:
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
@@ -110,9 +111,9 @@ def _begin(
         # `stop_when_solved` may have changed.
         solved = jax.numpy.bool_(chunks.learner.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
-        best_on_disk = save_proxies(directory, chunks.learner, jax.device_get(state), None)
+        save_proxies(directory, chunks.learner, jax.device_get(state), 0)
     # Buffers of its own, so that they can be donated.
-    return jax.tree.map(lambda x: x.copy(), state), best_on_disk
+    return jax.tree.map(lambda x: x.copy(), state)
 
 
 def _ended(
@@ -170,9 +171,7 @@ def interrupts_held() -> Iterator[None]:
         signal.raise_signal(heard[0])
 
 
-def save_proxies(
-    directory: RunDirectory, learner: Bilevel, state: LearnState, best_on_disk: int | None
-) -> int | None:
+def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, first: int) -> None:
     """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
     Where the search mean has diverged, the file before it stays.
@@ -181,16 +180,13 @@ def save_proxies(
       directory: of the run.
       learner: the functions of Algorithm 1.
       state: after the last generation that is saved, on the host.
-      best_on_disk: the generation of the best proxy that this session has written.
-
-    Returns:
-      The same after this call.
+      first: the first generation of which no proxy is written yet.
 
     Raises:
       OSError: if a file cannot be written.
     """
     if _all_diverged(directory, learner):
-        return best_on_disk
+        return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
     first_agent, names = learner.scoring.mixture.agents[0], learner.scoring.mixture.names
@@ -198,12 +194,12 @@ def save_proxies(
     # What was learned does not depend on the tracker, nor on where it was computed.
     config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
     for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
-        is_there = name == "proxy" and best_on_disk == generation
-        if is_there or not np.isfinite(flat).all():
+        path = directory.path / f"{name}.safetensors"
+        if (generation < first and path.exists()) or not np.isfinite(flat).all():
             continue
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
-            directory.path / f"{name}.safetensors",
+            path,
             learner.proxy,
             learner.unravel(flat),
             config,
@@ -213,7 +209,6 @@ def save_proxies(
             seed=directory.config["seed"],
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
-    return int(state.best_generation)
 
 
 def draw(directory: RunDirectory, learner: Bilevel) -> None:
