@@ -16,13 +16,18 @@ from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
+PANELS = {
+    "test_return": "return on the real task",
+    "train_steps": "training steps",
+    "train_episodes": "training episodes",
+}
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def learning_curve(
     rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path, title: str
 ) -> None:
-    """Draws `learning_curve.png`: scores above, agents' training steps below where they vary.
+    """Draws `learning_curve.png`: scores above, agents' training steps below.
 
     Args:
       rows: rows of `metrics.csv`, as text or numbers.
@@ -33,14 +38,8 @@ def learning_curve(
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
     agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
-    has_steps = any(map(_varies, (x for name, x in data.items() if "train_steps_mean" in name)))
     with plt.rc_context(STYLE):
-        size = (7, 5.5 if has_steps else 4)
-        heights = (2, 1)[: 1 + has_steps]
-        figure, axes = plt.subplots(
-            1 + has_steps, squeeze=False, figsize=size, sharex=True, height_ratios=heights
-        )
-        top, bottom = axes[0, 0], axes[-1, 0]
+        figure, (top, bottom) = plt.subplots(2, figsize=(7, 5.5), sharex=True, height_ratios=(2, 1))
         label = "incumbent: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
@@ -49,18 +48,15 @@ def learning_curve(
         for agent, color in zip(agents, itertools.cycle(AGENTS)):
             style = {"color": color, "lw": 1.3, "ls": "-."}
             top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
-            if has_steps:
-                bottom.plot(x, data[f"train_steps_mean_{agent}"], **style)
+            bottom.plot(x, data[f"train_steps_mean_{agent}"], **style)
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
             top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
         top.set_ylabel("score" if solved_score is None else "return on the real task")
         top.set_title(title)
         top.legend(frameon=False, fontsize=9, loc="best")
-        bottom.set_xlabel("generation")
-        if has_steps:
-            bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
-            bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
+        bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
+        bottom.set(xlabel="generation", ylabel="training steps\nof an agent", ylim=(0, None))
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
@@ -71,7 +67,7 @@ def evaluation(
     path: Path,
     title: str,
 ) -> None:
-    """Draws what agents trained in each world reached and, where it varies, what it took.
+    """Draws what agents trained in each world reached, and what it took.
 
     A point for each agent; the mean as a line and a number.
 
@@ -82,18 +78,13 @@ def evaluation(
       path: the picture.
       title: who was trained.
     """
-    panels = {"test_return": "return on the real task"}
-    for column in ("train_steps", "train_episodes"):
-        if _varies(np.concatenate([table[column] for table in tables.values()])):
-            panels[column] = column.replace("train_", "training ")
     worlds = list(dict.fromkeys(world for world, _ in tables))
     is_one = len(worlds) == len(tables)  # agent
     labels = [f"trained on\n{world}" if is_one else f"{key}\n{world}" for world, key in tables]
     with plt.rc_context(STYLE):
-        size = (len(panels) * max(3, 1.3 * len(tables)), 3.4)
-        figure, (axes,) = plt.subplots(1, len(panels), squeeze=False, figsize=size)
+        figure, axes = plt.subplots(1, 3, figsize=(3 * max(3, 1.3 * len(tables)), 3.4))
         figure.suptitle(title, fontsize=11)
-        for axis, (column, label) in zip(axes, panels.items(), strict=True):
+        for axis, (column, label) in zip(axes, PANELS.items(), strict=True):
             for x, ((world, _), table) in enumerate(tables.items()):
                 values = np.asarray(table[column], float)
                 color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
@@ -110,10 +101,6 @@ def evaluation(
         if solved_reward is not None:
             axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
-
-
-def _varies(numbers: np.ndarray) -> bool:
-    return np.unique(numbers).size > 1
 
 
 def _write(figure: Figure, path: Path) -> None:

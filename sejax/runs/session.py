@@ -28,10 +28,7 @@ PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "nump
 
 
 def run(
-    config: LearnConfig,
-    directory: RunDirectory,
-    chunks: Chunks,
-    report: Reporter | None = None,
+    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
 ) -> str:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
@@ -53,14 +50,11 @@ def run(
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config, directory, chunks, report)
-    tracked = TrackedRun(
-        folder=directory.path.resolve(),
-        id=directory.id,
-        generation=directory.finished_generations,
-        config=directory.config,
-    )
     drawn = time.monotonic()
-    with contextlib.closing(GuardedTracker(config.tracker, tracked, report.say)) as tracker:
+    folder, first = directory.path.resolve(), directory.finished_generations
+    tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
+    guarded = GuardedTracker(config.tracker, tracked, report.say)
+    with contextlib.closing(guarded) as tracker:
         while (ended := _ended(config, directory, learner, state)) is None:
             first = directory.finished_generations
             length = min(config.checkpoint_every, config.generations - first)

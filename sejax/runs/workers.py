@@ -28,16 +28,7 @@ from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Candidates, Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import (
-    ConfigError,
-    FailedError,
-    Options,
-    counts,
-    option,
-    require,
-    shortened,
-    told,
-)
+from sejax.options import ConfigError, FailedError, Options, counts, option, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
@@ -145,11 +136,10 @@ class RayConfig(Options):
                 warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            raise ConfigError(
-                f"machines.address must be a cluster that can be reached; got {self.address} "
-                f"({told(error)}). Start one with ray start --head, or set machines.address=local.",
-                "machines.address",
-            ) from error
+            must = "machines.address must be a cluster that can be reached"
+            fix = "Start one with ray start --head, or set machines.address=local."
+            message = f"{must}; got {self.address} ({told(error)}). {fix}"
+            raise ConfigError(message, "machines.address") from error
         compute = functools.partial(_on_cluster, self, setup_of(config))
         try:
             yield RemoteChunks(config, functools.partial(num_workers, self), compute)
@@ -349,13 +339,10 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
     """Most trainings in a share, and the program that computes them, for each agent of a run."""
     plain, expected = json.loads(setup)
     _use_one_core()
-    versions = runtime.versions()
-    require(
-        versions == expected,
-        "machines",
-        f"must have the same versions everywhere; got {versions} on {socket.gethostname()} and "
-        f"{expected} here. Set the same versions up there.",
-    )
+    if (versions := runtime.versions()) != expected:
+        got = f"{versions} on {socket.gethostname()} and {expected} here"
+        must = f"machines must have the same versions everywhere; got {got}"
+        raise ConfigError(f"{must}. Set the same versions up there.", "machines")
     runtime.configure_jax()
     config = configuration.learn_config(plain)
     learner = make_bilevel(**config.parts() | {"devices": 1})
