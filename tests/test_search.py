@@ -240,7 +240,8 @@ def test_trials_are_runs_of_the_command(tmp_path):
     search = search_config.read([*GRID, "es.noise_std=0.1,0.2", "max_generations=3", "seeds=2"])
     overrides = ["es.noise_std=0.2", "agent.learning_rate=0.5"]
     run = study.learning(search.trial_config(overrides), tmp_path / "trial", range(2))
-    assert run(1).scores.shape == (1,)
+    study.learning(search.trial_config(overrides), tmp_path / "trial/seed0", range(1))(2)
+    assert run(1).scores.shape == (1,)  # one of both was ahead, as after a kill
     progress = run(3)
     assert progress.scores.shape == (3,) and progress.generations == 3
     plain = [*GRID, *overrides, "generations=3", "checkpoint_every=1", f"run_dir={tmp_path}/run"]

@@ -30,10 +30,8 @@ from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, Search
 
-HINT = "Set search_dir=FOLDER, a new one."
 LONGEST_WAIT_S = 3600  # for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # what a database raises
-ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # of a trial
 
 
@@ -114,9 +112,9 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
         for seed in (config.seed + offset for offset in seeds):
             run_dir = str(folder if len(seeds) == 1 else folder / f"seed{seed}")
             one = dataclasses.replace(config, seed=seed, generations=generations, run_dir=run_dir)
-            with RunDirectory(one, HINT) as directory:
+            with RunDirectory(one, "Set search_dir=FOLDER.") as directory:
                 ends.append(session.run(one, directory, chunks))
-            of_run = [float(row["incumbent_mean"]) for row in directory.rows]
+            of_run = [float(row["incumbent_mean"]) for row in directory.rows[:generations]]
             computed.append(len(of_run))
             means.append(of_run + of_run[-1:] * (generations - len(of_run)))
             steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
@@ -160,7 +158,7 @@ def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) ->
         for name, distribution in space.items():  # of which it may lack some
             trial._suggest(name, distribution)
         return trial
-    if sum(trial.state in ENDED for trial in known) >= search.config.trials:
+    if sum(trial.state.is_finished() for trial in known) >= search.config.trials:
         return None
     if not any(trial.state == TrialState.WAITING for trial in known):
         # Drawn at once: whoever is killed meanwhile leaves no half of it, and draws the same again.
