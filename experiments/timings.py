@@ -23,7 +23,7 @@ import sejax
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
 from sejax.options import each_of
-from sejax.runs import session
+from sejax.runs import workers
 from sejax.runs.runtime import available_cores
 
 PAPER_CORES = 16
@@ -92,7 +92,7 @@ def config_of(settings: Timings, row: str, preset: str) -> Any:
 
 def time_generations(settings: Timings, row: str, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
-    chunks = session.make_chunks(config_of(settings, row, preset))
+    chunks = workers.make_chunks(config_of(settings, row, preset))
     program = chunks.learner
     state = chunks.init(jax.random.key(settings.seed))
     idle = jax.tree.map(lambda x: x.copy(), dataclasses.replace(state, solved=~state.solved))

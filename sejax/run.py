@@ -14,7 +14,7 @@ from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
-from sejax.runs.run_directory import open_for
+from sejax.runs.run_directory import RunDirectory
 
 ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
 real dynamics (proxy=rn), from agents trained on nothing else.
@@ -100,7 +100,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     with contextlib.ExitStack() as machines:
         compiled = None
         for config in configs:
-            with open_for(config) as directory, RunProgress(config) as progress:
+            with RunDirectory(config) as directory, RunProgress(config) as progress:
                 try:
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:

@@ -1,12 +1,19 @@
-"""`python -m sejax.search`: search hyperparameters with Optuna.
+"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 
-A trial is a run, whose generations are the budget; the same command goes on where it stopped.
+  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
+  python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
+
+The same command goes on where it stopped, or is one more worker of the same study. Searched are
+choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
+tag(log, inverse, ...) in 1 - x. Other overrides than the fields below are those of
+python -m sejax.run.
 """
 
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from sejax.options import ConfigError
+from sejax.options import ConfigError, as_text, help_texts, require, told
+from sejax.options.plain import to_plain
 from sejax.runs import commands, runtime
 
 
@@ -17,33 +24,33 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides or a study that cannot be searched, or without Optuna.
       OSError: if a file cannot be written.
     """
-    if find_spec("optuna") is None:
-        raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
+    require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
     from sejax.searching import config, study
 
     search = config.read(overrides)
-    with study.usable(search):
+    runtime.configure_jax()
+    try:
         current = study.open_study(search)
-        runtime.configure_jax()
         print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
-        try:
-            study.work(current, search)
-            study.report(current, search)
-        except KeyboardInterrupt as stop:
-            message = (
-                f"Interrupted. What has ended is saved in {search.folder}; the same command goes "
-                "on from there."
-            )
-            commands.interrupted(message, stop)
+        study.work(current, search)
+        study.report(current, search)
+    except study.UNUSABLE as error:
+        got = f"{search.folder / 'study.db'} ({told(error.__cause__ or error)})"
+        must = f"search_dir must hold a database that can be used; got {got}"
+        raise ConfigError(f"{must}. Set search_dir=FOLDER.", "search_dir") from error
+    except KeyboardInterrupt as stop:
+        saved = f"What has ended is saved in {search.folder}; the same command goes on from there."
+        commands.interrupted(f"Interrupted. {saved}", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    if find_spec("optuna") is None:
-        return f"{__doc__}\nIt needs pip install 'sejax[search]'."
-    from sejax.searching import config
+    require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
+    from sejax.searching.config import SearchConfig
 
-    return config.help_text()
+    texts, defaults = help_texts(SearchConfig), to_plain(SearchConfig())
+    fields = [f"  {name}={as_text(x)}  # {texts[name]}" for name, x in defaults.items()]
+    return "\n".join([str(__doc__), "Fields, with their defaults:", *fields])
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax.options import ConfigError, each_of, registry
 from sejax.runs import config as configuration
-from sejax.runs import session
+from sejax.runs import workers
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
          if module.name not in ("__main__", "common")]  # fmt: skip
@@ -99,7 +99,7 @@ def tiny(monkeypatch):
 
 
 def refuse_to_compute(monkeypatch):
-    places = {agents: "train", session.Chunks: "advance", score_transforms: "compute_cell"}
+    places = {agents: "train", workers.Chunks: "advance", score_transforms: "compute_cell"}
     for place, name in places.items():
         monkeypatch.setattr(place, name, refuse)
 

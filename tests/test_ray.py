@@ -30,13 +30,8 @@ pytestmark = [
 
 GENERATIONS = 12
 RUN = [
-    sys.executable,
-    "-m",
-    "sejax.run",
-    "env=cartpole",
-    "es.population_size=8",
-    f"generations={GENERATIONS}",
-    "checkpoint_every=1",
+    *(sys.executable, "-m", "sejax.run", "env=cartpole", "es.population_size=8"),
+    *(f"generations={GENERATIONS}", "checkpoint_every=1"),
 ]
 ENVIRONMENT = {
     **{name: x for name, x in os.environ.items() if not name.startswith(("XLA_FLAGS", "RAY_"))},
@@ -93,14 +88,8 @@ def started(folder, environment, *command):
     """A process in a session of its own, and the file with what it says."""
     log = folder / f"{time.monotonic_ns()}.log"
     with log.open("w") as said:
-        process = subprocess.Popen(
-            command,
-            start_new_session=True,
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=subprocess.STDOUT,
-            env=environment,
-        )
+        options = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": subprocess.STDOUT}
+        process = subprocess.Popen(command, start_new_session=True, env=environment, **options)
     return process, log
 
 
@@ -108,14 +97,9 @@ class Node:
     """A node of one CPU; its processes are those of a session."""
 
     def __init__(self, folder, *words):
-        self.process, self.log = started(
-            folder,
-            ENVIRONMENT,
-            *(sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--num-cpus=1"),
-            "--node-ip-address=127.0.0.1",
-            "--object-store-memory=100000000",
-            *words,
-        )
+        start = sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--num-cpus=1"
+        limits = "--node-ip-address=127.0.0.1", "--object-store-memory=100000000"
+        self.process, self.log = started(folder, ENVIRONMENT, *start, *limits, *words)
         wait_for(lambda: "Ray runtime started" in self.log.read_text())
 
     def workers(self):
@@ -135,13 +119,8 @@ class Cluster:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.environment = {**ENVIRONMENT, "RAY_ADDRESS": f"127.0.0.1:{self.port}"}
-        self.head = Node(
-            folder,
-            "--head",
-            f"--port={self.port}",
-            f"--temp-dir={folder}",
-            "--include-dashboard=false",
-        )
+        words = "--head", f"--port={self.port}", "--include-dashboard=false"
+        self.head = Node(folder, *words, f"--temp-dir={folder}")
         self.join()
 
     def join(self):

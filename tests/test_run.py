@@ -18,7 +18,7 @@ from support import metrics as rows
 
 import sejax
 from sejax import run
-from sejax.runs import commands, run_directory, runtime, session
+from sejax.runs import commands, run_directory, runtime, session, workers
 from sejax.runs import config as configuration
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
@@ -28,14 +28,13 @@ OWN = [*ROOM, "seed=12"]
 TINY = [*OWN, "agent.learning_rate=0.5"]
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
-RUN = [sys.executable, "-m", "sejax.run"]
 START = functools.partial(commands.start, run.main, run.help_text, run.config_text)
 
 
 @functools.cache
 def chunks(*words):
     """The compiled program of a configuration, which all runs of it share."""
-    return session.make_chunks(sejax.config([*TINY, *words]))
+    return workers.make_chunks(sejax.config([*TINY, *words]))
 
 
 class Report(Reporter):
@@ -52,7 +51,7 @@ def learn(path, *words, program=()):
     """A session of a run, as `sejax.run` has it; returns its messages."""
     config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
     report = Report()
-    with run_directory.open_for(config) as directory:
+    with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, chunks(*program), report)
     return "\n".join(report.said)
 
@@ -112,9 +111,9 @@ def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, monkey
 def test_seeds_run_one_after_the_other_on_one_executable(
     uninterrupted, tmp_path, monkeypatch, capsys
 ):
-    compiled, compile_ = [], session.Chunks.compile
+    compiled, compile_ = [], workers.Chunks.compile
     monkeypatch.setattr(
-        session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
+        workers.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
     )
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
     best = run.learn_all(run.configs_of([*TINY, *words]))
@@ -162,7 +161,7 @@ def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path
     (tmp_path / "my_tracker.py").write_text(TRACKER)
     monkeypatch.syspath_prepend(str(tmp_path))
     folder, word = tmp_path / "run", "tracker=my_tracker:make"
-    learn(folder, "generations=3", "checkpoint_every=3", word)
+    learn(folder, "generations=3", word)
     said = learn(folder, "generations=6", word, "tracker.fail_at=5")
     assert "tracker=my_tracker:make has failed" in said and "RuntimeError: out of paper" in said
     learn(folder, "generations=6", word)  # nothing is left to do: not even opened
@@ -185,13 +184,13 @@ FAMILIES = ("agents=[sarsa,q_learning]",)
 
 @functools.cache
 def family_chunks():
-    return session.make_chunks(sejax.config([*OWN, *FAMILIES]))
+    return workers.make_chunks(sejax.config([*OWN, *FAMILIES]))
 
 
 def learn_families(path, *words):
     """A session of a run with two families; returns the line that is printed of its last chunk."""
     config = sejax.config([*OWN, *words, f"run_dir={path}"])
-    with run_directory.open_for(config) as directory, RunProgress(config) as report:
+    with run_directory.RunDirectory(config) as directory, RunProgress(config) as report:
         session.run(config, directory, family_chunks(), report)
 
 
@@ -269,29 +268,22 @@ runpy.run_module("sejax.run", run_name="__main__", alter_sys=True)
 """
 
 
-def process(*words: str, flags: str | None = None) -> subprocess.CompletedProcess[str]:
-    """A process of its own, with other XLA flags if they are given."""
+def process(*words: str) -> subprocess.CompletedProcess[str]:
+    """A process of its own."""
     cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
              "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}  # fmt: skip
-    xla = {} if flags is None else {"XLA_FLAGS": flags}
-    return subprocess.run(words, capture_output=True, text=True, timeout=1800,
-                          env=os.environ | cache | xla)  # fmt: skip
+    environment = os.environ | cache
+    return subprocess.run(words, capture_output=True, text=True, timeout=1800, env=environment)
 
 
-def test_a_killed_run_goes_on_to_the_same_numbers_with_the_flags_that_users_have(tmp_path):
-    words = [*TINY, "generations=4"]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    ended = process(*RUN, *words, f"run_dir={whole}", flags="")
-    assert ended.returncode == 0, ended.stderr
-    driven = sys.executable, "-c", DRIVER, "SIGKILL", *words, f"run_dir={killed}"
-    ended = process(*driven, flags="")
+def test_a_killed_run_goes_on_to_the_same_numbers(uninterrupted, tmp_path):
+    words = [*TINY, "generations=6", f"run_dir={tmp_path}"]
+    ended = process(sys.executable, "-c", DRIVER, "SIGKILL", *words)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
-    assert len(rows(killed)) == 2
-    finished = process(*RUN, *words, f"run_dir={killed}", flags="")
-    assert finished.returncode == 0, finished.stderr
-    assert "Going on at generation 2" in finished.stdout and "learned" in finished.stdout
-    assert_same(killed, whole)
-    assert {path.name for path in killed.iterdir()} == FILES
+    assert len(rows(tmp_path)) == 2
+    assert "Going on at generation 2" in learn(tmp_path, "generations=6")
+    assert_same(tmp_path, uninterrupted)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -314,13 +306,13 @@ def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, caps
 
 
 def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
-    def go(generations, stop):
-        learn(tmp_path, f"generations={generations}", program=(f"stop_when_solved={stop}",))
+    def go(generations, *program):
+        learn(tmp_path, f"generations={generations}", program=program)
         return json.loads((tmp_path / "run.json").read_text())["ended"]
 
-    assert go(6, "true") == "solved" and len(rows(tmp_path)) == 3
-    assert go(6, "false") == "finished" and rows(tmp_path) == rows(uninterrupted)
-    assert go(9, "true") == "solved" and rows(tmp_path) == rows(uninterrupted)
+    assert go(6, "stop_when_solved=true") == "solved" and len(rows(tmp_path)) == 3
+    assert go(6) == "finished" and rows(tmp_path) == rows(uninterrupted)
+    assert go(9, "stop_when_solved=true") == "solved" and rows(tmp_path) == rows(uninterrupted)
 
 
 def test_an_interrupt_waits_until_files_are_written():

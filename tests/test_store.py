@@ -1,6 +1,9 @@
 """The store: entries of the same settings, whole or not there. Kills: test_run_directory.py."""
 
 import os
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -79,11 +82,30 @@ def test_a_damaged_entry_a_folder_or_a_sparse_file_of_30_gb_is_refused(folder):
 # --- locks ---------------------------------------------------------------------------------------
 
 
-def test_a_locked_folder_is_ones_own_and_an_unused_one_is_removed(tmp_path):
+HOLD = """
+import pathlib, sys
+from sejax.runs.store import Store
+with Store(pathlib.Path(sys.argv[1]), {}):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+def test_a_folder_is_a_processs_own_until_it_is_killed_and_unused_it_is_removed(tmp_path):
     folder = tmp_path / "new"
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    with process:
+        assert process.stdout.readline() == "held\n"
+        assert refused(Store(folder, SETTINGS).lock) == "run_dir"
+        process.send_signal(signal.SIGKILL)
+        process.wait(timeout=60)
     with Store(folder, SETTINGS) as store:
         assert refused(Store(folder, SETTINGS).lock) == "run_dir"
-    assert not folder.exists()
-    with store:
         store.put("rounds")
     assert store.get("rounds") == ({}, {})
+    with Store(tmp_path / "other", SETTINGS):
+        pass
+    assert not (tmp_path / "other").exists()

@@ -20,9 +20,9 @@ from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.runs import commands
 from sejax.runs import config as configuration
-from sejax.runs.run_directory import columns_of
+from sejax.runs.run_directory import COLUMNS
+from sejax.runs.store import Store
 from sejax.searching import config as settings
-from sejax.searching import study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]
@@ -76,7 +76,7 @@ def write_run(path, config):
     path.mkdir()
     (path / "config.yaml").write_text(yaml.safe_dump(config))
     row = "0,0,1.0,0.0,0.0,1.0,1.0,20,20,2.0,0,10,0.5"
-    (path / "metrics.csv").write_text(f"{','.join(columns_of())}\n{row}\n")
+    (path / "metrics.csv").write_text(f"{','.join(COLUMNS)}\n{row}\n")
     return path
 
 
@@ -99,7 +99,7 @@ def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreig
     assert isinstance(refusal(configuration.learn_config, stored(**foreign)), sejax.ConfigError)
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
-    rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}
+    rows = {"metrics": np.frombuffer(f"{','.join(COLUMNS)}\n".encode(), np.uint8)}
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
     data = checksummed.pack(rows, "sejax_run", manifest)
     (path / "checkpoint.safetensors").write_bytes(data)
@@ -136,17 +136,19 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     assert (folder / "typed").exists()
 
 
-STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]
+STUDIES = [
+    {"env": SHELL},
+    {"env": {"name": IMPORTED}},
+    {"ranges": {"agent": f"choice(q_learning,{IMPORTED})"}},
+    {"run_dir": "victim"},
+]
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("stored", STUDIES, ids=range(len(STUDIES)))
 def test_a_study_is_compared_as_text(folder, refused, stored):
     words = [*TASK, SPACE, f"search_dir={folder / 'theirs'}"]
-    mine = settings.read(words)
-    theirs = mine.stored() | stored if isinstance(stored, dict) else stored
-    study.open_study(mine).set_user_attr(study.STORED, theirs)
-    assert "study must be" in refused(search_command, *words)
+    Store(folder / "theirs", settings.read(words).settings() | stored).put("search")
+    assert "search_dir must be" in refused(search_command, *words)
     assert not (folder / "victim").exists()
 
 
@@ -166,8 +168,6 @@ def write_proxy(config):
 def test_a_proxys_file_names_no_module(folder, refused, foreign):
     write_proxy(foreign)
     refused(evaluate_command, "proxy=evil.safetensors", "agent_hparams=as_learned", "out_dir=out")
-    if "agents" not in foreign:  # of which nothing is read there
-        refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
 
 
 @pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"env", "proxy"} & {*x}])

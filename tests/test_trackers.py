@@ -1,12 +1,10 @@
 """Trackers: what they hear, where they go on, and that one that fails is dropped."""
 
 import struct
-import types
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sejax.runs import trackers
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, TrackedRun
@@ -35,7 +33,6 @@ class Listener:
 
 
 def tracked_run(path, generation=0):
-    Image.new("RGB", (4, 3), "red").save(path / "learning_curve.png")
     config = {"env": {"name": "cartpole"}, "seed": 7}
     return TrackedRun(folder=path, id="0123abcd", generation=generation, config=config)
 
@@ -97,18 +94,16 @@ def events(folder):
             data = data[16 + length :]
 
 
-def test_tensorboard_reads_scalars_histograms_and_the_curve(tmp_path):
+def test_tensorboard_reads_scalars_and_histograms(tmp_path):
     pytest.importorskip("tensorboardX", reason="pip install 'sejax[tensorboard]'")
     track(tmp_path, trackers.TensorBoardConfig())
-    found = [(event.step, value) for event in events(tmp_path / "tensorboard")
-             for value in event.summary.value]  # fmt: skip
-    means = [(step, x.simple_value) for step, x in found if x.tag == "incumbent_mean"]
+    values = [(event.step, value) for event in events(tmp_path / "tensorboard")
+              for value in event.summary.value]  # fmt: skip
+    means = [(step, x.simple_value) for step, x in values if x.tag == "incumbent_mean"]
     assert means == [(0, 2.5), (1, 2.5), (2, 2.5)]
-    counts = [(step, x.histo.num) for step, x in found if x.tag == "population_scores"]
+    counts = [(step, x.histo.num) for step, x in values if x.tag == "population_scores"]
     assert counts == [(0, 2), (1, 2), (2, 2)]
-    pictures = [(step, x.image.width) for step, x in found if x.tag == "learning_curve"]
-    assert pictures == [(2, 4), (3, 4)]
-    assert "cartpole" in str(next(x for _, x in found if x.tag.startswith("config")))
+    assert "cartpole" in str(next(x for _, x in values if x.tag.startswith("config")))
 
 
 @pytest.mark.filterwarnings("default")
@@ -120,16 +115,3 @@ def test_wandb_keeps_a_run_offline_and_goes_on_with_it(tmp_path, monkeypatch):
     sessions = sorted((tmp_path / "wandb").glob("offline-run-*-0123abcd/*.wandb"))
     assert len(sessions) in (1, 2)  # one folder for each, named by the second
     assert b"population_scores" in sessions[0].read_bytes()
-
-
-def test_the_picture_takes_no_step_that_a_run_which_goes_on_will_log(tmp_path):
-    """wandb drops what is logged with a step below the last one."""
-    module = types.SimpleNamespace(Image=str, Histogram=list)
-    steps = []
-    logged = types.SimpleNamespace(log=lambda values, step: steps.append(step), finish=lambda: None)
-    for numbers in (range(3), range(3, 5)):
-        wandb = trackers.Wandb(tracked_run(tmp_path, numbers.start), module, logged)
-        for number in numbers:
-            wandb.on_generation(generation(number))
-        wandb.close()
-    assert steps == [0, 1, 2, 2, 3, 4, 4]

@@ -5,46 +5,36 @@ import sys
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 from support import ROOM, bits, printed, refusal, refused
 
 import sejax
-from sejax.bilevel import make_bilevel
-from sejax.runs import runtime, session, workers
-from sejax.runs.workers import Batch, RemoteChunks, cut
-
-
-def test_shares_make_up_all_places_in_whole_batches_and_shrink():
-    shares = list(cut(np.arange(100), Batch(capacity=16, width=4), num_workers=2))
-    assert list(np.concatenate(shares)) == list(range(100))
-    assert [len(share) for share in shares] == [16, 16, 16, 16, 12, 8, 4, 4, 4, 4]
-
-
-# --- the numbers of a single process -------------------------------------------------------------
+from sejax.runs import runtime, workers
+from sejax.runs.workers import Chunks, RemoteChunks
 
 
 def require_equal_numbers(words, generations):
     """Runs generations in one program, and in shares, of which the last one comes first."""
     config = sejax.config(words)
-    learner = make_bilevel(**config.parts() | {"devices": 1})
-    batches = [Batch(capacity=5, width=1)] * len(learner.evaluate.sizes)
-    setup = workers.setup_of(config, batches, 0.0)
+    setup = workers.setup_of(config)
+    sizes = []
 
     def compute(shares):
+        sizes.extend(len(trainings.active) for _, trainings in shares)
         return [workers.score(setup, share) for share in reversed(shares)][::-1]
 
-    remote, local = RemoteChunks(learner, batches, lambda: 2, compute), session.Chunks(learner)
+    remote = RemoteChunks(config, lambda: 2, compute)
+    local = Chunks(remote.learner)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))
     for _ in range(generations):
         state, info = local.advance(state, 1)
         other, other_info = remote.advance(other, 1)
         assert bits((state, info)) == bits((other, other_info))
-    assert remote.cpu_s > 0
+    assert remote.cpu_s > 0 and len(sizes) > generations
     return state
 
 
-SOLVING = [*ROOM, "es.population_size=4", "stop_when_solved=true"]
+SOLVING = [*ROOM, "es.population_size=4", "stop_when_solved=true", "num_parallel=2"]
 
 
 def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
@@ -77,22 +67,14 @@ def test_so_they_do_with_the_flags_of_a_command(case):
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):
-    setup = workers.setup_of(sejax.config(SOLVING), [Batch(5, 1)], 0.0)
+    setup = workers.setup_of(sejax.config(SOLVING))
     monkeypatch.setattr(runtime, "versions", lambda: {"jax": "0.1"})
-    error = refusal(workers.score, setup, workers.Share(0, ()))
+    error = refusal(workers.score, setup, (0, ()))
     assert error.field == "machines" and "0.1" in str(error)
 
 
-# --- the command ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("words", "field"),
-    [
-        (["devices=2"], "devices"),
-        (["machines.workers=0"], "machines.workers"),
-        (["machines.gpus_per_worker=2"], "machines.gpus_per_worker"),
-    ],
+    ("words", "field"), [(["devices=2"], "devices"), (["machines.workers=0"], "machines.workers")]
 )
 def test_settings_that_no_worker_can_have_are_refused(words, field, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: "there")

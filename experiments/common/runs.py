@@ -22,7 +22,7 @@ from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
 from sejax.runs import config as configuration
-from sejax.runs import run_directory, session
+from sejax.runs import run_directory, session, workers
 from sejax.runs.progress import Tally
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
@@ -74,7 +74,7 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
 
 
 def learn(
-    configs: list[Any], option: str = "work", chunks: session.Chunks | None = None
+    configs: list[Any], option: str = "work", chunks: workers.Chunks | None = None
 ) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
@@ -89,11 +89,11 @@ def learn(
     Raises:
       ConfigError: if a folder holds a run of other settings or of more generations, or is in use.
     """
-    chunks = chunks or session.make_chunks(configs[0])
+    chunks = chunks or workers.make_chunks(configs[0])
     curves = []
     with Tally(len(configs), "NES runs") as tally:
         for config in configs:
-            with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
+            with run_directory.RunDirectory(config, f"Set {option}=DIR.") as directory:
                 path = directory.path / "cpu_s.txt"
                 session.run(config, directory, timed(chunks, path))
                 curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
@@ -160,7 +160,7 @@ def summarise(curves: pd.DataFrame, by: Sequence[str], solved_reward: float) -> 
 # --- what generations cost -----------------------------------------------------------------------
 
 
-def timed(chunks: session.Chunks, path: Path) -> session.Chunks:
+def timed(chunks: workers.Chunks, path: Path) -> workers.Chunks:
     """The same compiled generations, which write down their CPU seconds.
 
     CPU seconds are those of this process on all of its threads, while it computes a generation:

@@ -10,21 +10,24 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
+PANELS = {
+    "test_return": "return on the real task",
+    "train_steps": "training steps",
+    "train_episodes": "training episodes",
+}
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def learning_curve(
     rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path, title: str
 ) -> None:
-    """Draws `learning_curve.png`: scores above, agents' training steps below where they vary.
+    """Draws `learning_curve.png`: scores above, agents' training steps below.
 
     Args:
       rows: rows of `metrics.csv`, as text or numbers.
@@ -35,38 +38,25 @@ def learning_curve(
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
     agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
-    has_steps = any(map(_varies, (x for name, x in data.items() if "train_steps_mean" in name)))
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            1 + has_steps,
-            squeeze=False,
-            figsize=(7, 5.5 if has_steps else 4),
-            sharex=True,
-            height_ratios=(2, 1)[: 1 + has_steps],
-            layout="constrained",
-        )
-        top, bottom = axes[0, 0], axes[-1, 0]
+        figure, (top, bottom) = plt.subplots(2, figsize=(7, 5.5), sharex=True, height_ratios=(2, 1))
         label = "incumbent: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
         for agent, color in zip(agents, itertools.cycle(AGENTS)):
-            label = f"incumbent: {agent}"
-            top.plot(x, data[f"incumbent_mean_{agent}"], color=color, lw=1.3, ls="-.", label=label)
-            if has_steps:
-                bottom.plot(x, data[f"train_steps_mean_{agent}"], color=color, lw=1, ls="-.")
+            style = {"color": color, "lw": 1.3, "ls": "-."}
+            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
+            bottom.plot(x, data[f"train_steps_mean_{agent}"], **style)
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
             top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
         top.set_ylabel("score" if solved_score is None else "return on the real task")
         top.set_title(title)
         top.legend(frameon=False, fontsize=9, loc="best")
-        bottom.set_xlabel("generation")
-        if has_steps:
-            bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
-            bottom.set_ylabel("training steps\nof an agent")
-            bottom.set_ylim(bottom=0)
+        bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
+        bottom.set(xlabel="generation", ylabel="training steps\nof an agent", ylim=(0, None))
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
@@ -77,9 +67,9 @@ def evaluation(
     path: Path,
     title: str,
 ) -> None:
-    """Draws what agents trained in each world reached and, where it varies, what it took.
+    """Draws what agents trained in each world reached, and what it took.
 
-    A column for each world, in it one for each agent of several, each with its colour.
+    A point for each agent; the mean as a line and a number.
 
     Args:
       tables: by world and agent, columns `test_return`, `train_steps` and `train_episodes`, each
@@ -88,53 +78,33 @@ def evaluation(
       path: the picture.
       title: who was trained.
     """
-    worlds, keys = (list(dict.fromkeys(names)) for names in zip(*tables, strict=True))
-    panels = {"test_return": "return on the real task"}
-    for column in ("train_steps", "train_episodes"):
-        if _varies(np.concatenate([table[column] for table in tables.values()])):
-            panels[column] = column.replace("train_", "training ")
+    worlds = list(dict.fromkeys(world for world, _ in tables))
+    is_one = len(worlds) == len(tables)  # agent
+    labels = [f"trained on\n{world}" if is_one else f"{key}\n{world}" for world, key in tables]
     with plt.rc_context(STYLE):
-        width = 3 + 0.8 * (len(keys) - 1)
-        figure, (axes,) = plt.subplots(
-            1, len(panels), squeeze=False, figsize=(len(panels) * width, 3.4), layout="constrained"
-        )
+        figure, axes = plt.subplots(1, 3, figsize=(3 * max(3, 1.3 * len(tables)), 3.4))
         figure.suptitle(title, fontsize=11)
-        for axis, (column, label) in zip(axes, panels.items(), strict=True):
-            for (world, key), table in tables.items():
-                place = worlds.index(world) * (len(keys) + 0.5) + keys.index(key)
-                color = AGENTS[keys.index(key) % len(AGENTS)]
-                if len(keys) == 1:
-                    color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
-                _strip(axis, place, np.asarray(table[column], float), color)
-            middles = [i * (len(keys) + 0.5) + (len(keys) - 1) / 2 for i in range(len(worlds))]
-            axis.set_xticks(middles, [f"trained on\n{world}" for world in worlds])
+        for axis, (column, label) in zip(axes, PANELS.items(), strict=True):
+            for x, ((world, _), table) in enumerate(tables.items()):
+                values = np.asarray(table[column], float)
+                color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
+                spread = x + np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
+                axis.plot(spread, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
+                mean = values.mean()
+                axis.hlines(mean, x - 0.28, x + 0.28, color=color, lw=2.5)
+                axis.annotate(f"{mean:,.1f}", (x + 0.3, mean), fontsize=9, va="center")
+            axis.set_xticks(range(len(tables)), labels)
             axis.margins(x=0.2)
             axis.set_title(label, fontsize=10)
             if column != "test_return":
                 axis.set_ylim(bottom=0)
-        if len(keys) > 1:
-            lines = [Line2D([], [], color=color) for _, color in zip(keys, itertools.cycle(AGENTS))]
-            axes[0].legend(lines, keys, frameon=False, fontsize=9)
         if solved_reward is not None:
             axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
 
 
-def _strip(axis: Axes, place: float, values: np.ndarray, color: str) -> None:
-    """A point for each agent above a place of the axis, and their mean as a line and a number."""
-    spread = place + np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
-    axis.plot(spread, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
-    mean = values.mean()
-    axis.hlines(mean, place - 0.28, place + 0.28, color=color, lw=2.5)
-    text = f"{mean:,.0f}" if abs(mean) >= 1000 else f"{mean:,.1f}"
-    axis.annotate(text, (place + 0.3, mean), fontsize=9, va="center")
-
-
-def _varies(numbers: np.ndarray) -> bool:
-    return np.unique(numbers).size > 1
-
-
 def _write(figure: Figure, path: Path) -> None:
+    figure.set_layout_engine("constrained")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)
     plt.close(figure)

@@ -1,7 +1,7 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -14,14 +14,23 @@ from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, Reporter
 
 
-def _live_line(console: Console, text: str, **options: Any) -> Progress:
-    """One line that changes on a terminal, and nothing elsewhere."""
-    columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn(text), TextColumn("left")
-    left = TimeRemainingColumn(elapsed_when_finished=False)
-    return Progress(*columns, left, console=console, disable=not console.is_terminal, **options)
+class _Line(Progress):
+    """One line that changes on a terminal, and nothing elsewhere.
+
+    Attributes:
+      is_live: whether it is on a terminal.
+    """
+
+    def __init__(self, text: str, total: int, things: str = "", **options: Any):
+        console = Console(highlight=False, markup=False)
+        self.is_live = console.is_terminal
+        columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn(text), TextColumn("left")
+        left = TimeRemainingColumn(elapsed_when_finished=False)
+        super().__init__(*columns, left, console=console, disable=not self.is_live, **options)
+        self._task, self._total = self.add_task(things, total=total), total
 
 
-class Tally:
+class Tally(_Line):
     """One live line on a terminal: how many are done of all, and the time left.
 
     Elsewhere one line says what is being done.
@@ -33,101 +42,76 @@ class Tally:
     """
 
     def __init__(self, total: int, things: str):
-        console = Console(highlight=False, markup=False)
-        self.is_live = console.is_terminal
+        counted = "{task.completed:,.0f}/{task.total:,.0f} {task.description}"
+        super().__init__(counted, total, things, transient=True)
         if not self.is_live:
             print(f"training {total:,} {things} ...", flush=True)
-        counted = "{task.completed:,.0f}/{task.total:,.0f} {task.description}"
-        self._progress = _live_line(console, counted, transient=True)
-        self._task = self._progress.add_task(things, total=total)
-        self._total = total
-
-    def __enter__(self) -> "Tally":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._progress.stop()
 
     def add(self, count: int = 1) -> None:
         """Counts what is done, from any thread; there are no more than all."""
-        self._progress.update(self._task, advance=count)
-        if self._progress.tasks[0].completed > self._total:
-            self._progress.update(self._task, completed=self._total)
+        self.update(self._task, advance=count)
+        if self.tasks[0].completed > self._total:
+            self.update(self._task, completed=self._total)
 
 
-class RunProgress(Reporter):
+class RunProgress(_Line, Reporter):
     """One live line on a terminal; one line for each generation elsewhere."""
 
     def __init__(self, config: LearnConfig):
-        self._config = config
-        self._console = Console(highlight=False, markup=False)
-        self._progress = _live_line(self._console, "{task.description}")
-        self._task = self._progress.add_task("", total=config.generations)
-        self._started, self._steps = time.monotonic(), 0
+        super().__init__("{task.description}", config.generations)
+        self._config, self._started, self._steps = config, time.monotonic(), 0
 
-    def __enter__(self) -> "RunProgress":
-        self._progress.start()
+    def __enter__(self) -> Self:
         env, proxy = self._config.name("env"), self._config.name("proxy")
         if not preset_files.is_tuned(env, proxy):
             self.say(
                 f"There are no tuned settings for env={env} with proxy={proxy}: these are general "
                 "ones, not tuned (docs/defaults.md)."
             )
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.stop()
-
-    def stop(self) -> None:
-        self._progress.stop()
+        return super().__enter__()
 
     def status(self, text: str) -> None:
         """Shows what is being done before the first generation."""
-        self._progress.update(self._task, description=text)
+        self.update(self._task, description=text)
         self._started = time.monotonic()
-        if not self._console.is_terminal:
+        if not self.is_live:
             self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
         """Prints a line that stays."""
-        self._console.print(text, soft_wrap=True)
+        self.console.print(text, soft_wrap=True)
 
     def on_generation(self, info: FinishedGeneration) -> None:
         """Shows the numbers of a generation; steps per second are the session's so far."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
-        values, means = info.values, ""
-        if len(self._config.scored_agents) > 1:
-            each = (f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in self._config.scored_agents)
-            means = f" ({', '.join(each)})"
+        values, agents = info.values, self._config.scored_agents
+        means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents[1:] and agents)
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
             f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
-            f"{means}, best {values['best_so_far']:.1f}, "
+            f"{means and f' ({means})'}, best {values['best_so_far']:.1f}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         if values["num_nonfinite"]:
             text += f", {values['num_nonfinite']:.0f} diverged"
-        self._progress.update(self._task, completed=info.generation + 1, description=text)
-        if not self._console.is_terminal:
+        self.update(self._task, completed=info.generation + 1, description=text)
+        if not self.is_live:
             self.say(text)
 
     def finish(self, directory: RunDirectory, learner: Bilevel, best: float) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        title, verdict = "learned", f"best incumbent score {best:.1f}"
+        path, solved_score = directory.path, learner.solved_score
+        is_solved = solved_score is not None and best >= solved_score
+        verdict = f"best incumbent score {best:.1f}"
         if learner.scoring.objective.meaning:
             verdict += f": {learner.scoring.objective.meaning}"
-        if learner.solved_score is not None:
-            is_solved = best >= learner.solved_score
-            title = "solved" if is_solved else "learned"
-            verdict = (
-                f"{'solved' if is_solved else 'not solved'}: best incumbent mean {best:.1f}, "
-                f"solved at {learner.solved_score:g}"
-            )
-        path = directory.path
-        self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
+        if solved_score is not None:
+            verdict = "solved" if is_solved else "not solved"
+            verdict += f": best incumbent mean {best:.1f}, solved at {solved_score:g}"
+        title = "solved" if is_solved else "learned"
+        self.console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
@@ -135,20 +119,20 @@ class RunProgress(Reporter):
             f"  {path}/metrics.csv          a row for each generation\n\n"
             "Train fresh agents on it, and on the real task beside them:\n"
             f"  python -m sejax.evaluate proxy={path}{self._plugin_words()} num_agents=20\n"
-            f"Use it as a gymnax environment:\n"
+            "Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{self._plugin_arguments()})'
         )
 
     def _plugin_words(self) -> str:
-        """The overrides that name plugins, which `sejax.evaluate` imports only if it is told to."""
-        env, proxy = self._config.name("env"), self._config.name("proxy")
-        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
-        words = f" env={env}" if ":" in env else ""
-        words += f" proxy_kind={proxy}" if ":" in proxy else ""
-        if any(":" in name for name in agents):
-            several = f"agents=[{','.join(agents)}]"
-            words += f" {several}" if len(agents) > 1 else f" agent={agents[0]}"
-        return words
+        """The overrides that name plugins, as `sejax.evaluate` imports only what is typed."""
+        names = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
+        agents = f"[{','.join(names)}]" if len(names) > 1 else names[0]
+        words = {
+            "env": self._config.name("env"),
+            "proxy_kind": self._config.name("proxy"),
+            "agents" if len(names) > 1 else "agent": agents,
+        }
+        return "".join(f" {name}={text}" for name, text in words.items() if ":" in text)
 
     def _plugin_arguments(self) -> str:
         """The arguments of `sejax.load` for plugins, as no name in a file is imported."""

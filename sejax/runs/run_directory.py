@@ -7,8 +7,7 @@ changes nothing.
 
 import json
 import secrets
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -25,128 +24,85 @@ from sejax.runs.store import Store
 from sejax.scoring import GenerationInfo
 
 COLUMNS = (
-    "generation",
-    "seed",
-    "incumbent_mean",
-    "incumbent_std",
-    "population_mean",
-    "population_max",
-    "best_so_far",
-    "train_steps_mean",
-    "train_steps_max",
-    "train_episodes_mean",
-    "num_nonfinite",
-    "env_steps_total",
-    "wall_s",
+    *("generation", "seed", "incumbent_mean", "incumbent_std", "population_mean", "population_max"),
+    *("best_so_far", "train_steps_mean", "train_steps_max", "train_episodes_mean"),
+    *("num_nonfinite", "env_steps_total", "wall_s"),
 )
 # Columns that each agent of a mixture has too, with its name at the end.
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
-# Fields and groups that say how or how long to compute, not what: they may change between two
-# sessions of a run.
-FREE_FIELDS = {
-    "generations",
-    "stop_when_solved",
-    "devices",
-    "checkpoint_every",
-    "run_dir",
-    "tracker",
-    "machines",
-}
-HINT = "Set run_dir=FOLDER."
+# Fields and groups that may change between two sessions: how long a run is, how it is computed.
+LENGTH_FIELDS = {"generations", "stop_when_solved", "checkpoint_every"}
+FREE_FIELDS = LENGTH_FIELDS | {"devices", "run_dir", "tracker", "machines"}
 
 _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # of the checkpoint's tensors
 # Files whose temporaries a killed session leaves.
-_WRITTEN = (
-    "checkpoint.safetensors",
-    _METRICS,
-    _CONFIG,
-    "proxy.safetensors",
-    "proxy_last.safetensors",
-    "learning_curve.png",
-    "run.json",
-)
+_WRITTEN = ("*.safetensors", _METRICS, _CONFIG, "learning_curve.png", "run.json")
 # Files that only a run leaves; without its checkpoint they come from an older sejax, or it is lost.
 _SIGNS_OF_A_RUN = (_METRICS, "proxy.safetensors", "checkpoint")
 State = TypeVar("State")
 
 
-class RunDirectory:
-    """One run's folder, which this process alone uses until `close`.
+class RunDirectory(Store):
+    """One run's folder, which this process alone uses within `with`.
 
     Call `restore` once, then `save` after each block of generations.
 
+    What it stores is compared as plain values: nothing that only the folder names is imported.
+
+    Args:
+      config: of the run.
+      hint: last sentence of messages: how to choose another folder.
+
     Attributes:
-      path: the folder.
+      path: the folder; made, or that of an earlier session of the same run.
       config: the configuration, plain values in nested mappings.
-      columns: of `metrics.csv`.
+      columns: of `metrics.csv`: with several agents, four more for each of them.
       rows: the rows of `metrics.csv`, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
       versions: of the packages that decide the numbers, as the checkpoint was written.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        config: dict[str, Any],
-        agents: Sequence[str] = (),
-        hint: str = HINT,
-        completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
-    ):
-        """Makes the folder, or opens that of an earlier session of the same run.
+    def __init__(self, config: LearnConfig, hint: str = ""):
+        super().__init__(
+            config.resolved_run_dir,
+            configuration.plain(config),
+            hint=hint,
+            free=FREE_FIELDS,
+            completed=lambda stored: configuration.completed(stored, config),
+        )
+        self.path, self.config = self.folder, self.settings
+        self.rows: list[dict[str, str]] = []
+        self.id, self.cpu_s = secrets.token_hex(4), 0.0
+        self.versions: object = runtime.versions()
+        self._agents = config.scored_agents if len(config.scored_agents) > 1 else ()
+        of_agents = [f"{name}_{agent}" for agent in self._agents for name in AGENT_COLUMNS]
+        self.columns = (*COLUMNS, *of_agents)
+        self._tensors: dict[str, np.ndarray] | None = None
 
-        Args:
-          path: the folder.
-          config: the configuration, plain values in nested mappings; `seed` is read.
-          agents: names of the agents; each of several has columns of its own.
-          hint: last sentence of messages: how to choose another folder.
-          completed: adds to a stored configuration the fields that an older version did not write.
+    def lock(self) -> None:
+        """Takes the folder, and reads what the checkpoint holds, if there is one.
 
         Raises:
           ConfigError: if the folder holds another run or a damaged one, is in use by another
             process, or cannot be written.
         """
-        self.path = Path(path)
-        self._store = Store(self.path, config, hint=hint, free=FREE_FIELDS, completed=completed)
-        self.config = self._store.settings
-        self.columns = columns_of(agents)
-        self.rows: list[dict[str, str]] = []
-        self.id, self.cpu_s = secrets.token_hex(4), 0.0
-        self.versions: object = runtime.versions()
-        self._agents = agents if len(agents) > 1 else ()
-        self._tensors: dict[str, np.ndarray] | None = None
-        self._store.lock()
+        super().lock()
         try:
             self._open()
         except BaseException:
-            self.close()
+            self.release()
             raise
-
-    def close(self) -> None:
-        """Lets other processes use the folder; without a run there, leaves nothing behind."""
-        self._store.release()
-
-    def __enter__(self) -> "RunDirectory":
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()
 
     @property
     def finished_generations(self) -> int:
         """Generations that are saved."""
         return len(self.rows)
 
-    @property
-    def wall_s(self) -> float:
-        """Seconds of all sessions up to the checkpoint."""
-        return float(self.rows[-1]["wall_s"]) if self.rows else 0.0
-
-    @property
-    def real_steps(self) -> int:
-        """Steps on the real task up to the checkpoint."""
-        return int(self.rows[-1]["env_steps_total"]) if self.rows else 0
+    def last(self, column: str) -> str:
+        """The value in the last row that is saved; 0 without one."""
+        return self.rows[-1][column] if self.rows else "0"
 
     def restore(self, like: State) -> State | None:
         """The state of the checkpoint, and the files beside it remade; None for a new run.
@@ -163,7 +119,7 @@ class RunDirectory:
         try:
             state = as_tree(self._tensors, like)
         except ValueError as error:
-            raise self._store.damaged(_CHECKPOINT, error) from error
+            raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = None
         self._remake()
         return state
@@ -191,7 +147,7 @@ class RunDirectory:
         csv, is_first = self._as_csv([*self.rows, *new]), not self.rows
         tensors = as_tensors(state) | {_ROWS: np.frombuffer(csv.encode(), np.uint8)}
         versions = runtime.versions()
-        self._store.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=versions)
+        self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=versions)
         self.rows, self.cpu_s = [*self.rows, *new], cpu_s
         if is_first:
             self._remake()
@@ -210,7 +166,7 @@ class RunDirectory:
 
     def _open(self) -> None:
         """Takes over what the checkpoint holds, if there is one."""
-        entry = self._store.get(_CHECKPOINT)
+        entry = self.get(_CHECKPOINT)
         if entry is None:
             self._require_no_other_run()
             return
@@ -222,26 +178,24 @@ class RunDirectory:
             self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
             self.id, self.cpu_s = str(values["id"]), float(values["cpu_s"])
             self.versions = values.get("versions", self.versions)
-            _ = self.wall_s, self.real_steps
+            _ = float(self.last("wall_s")), int(self.last("env_steps_total"))
         except (KeyError, TypeError, ValueError) as error:
-            raise self._store.damaged(_CHECKPOINT, error) from error
+            raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = tensors
 
     def _require_no_other_run(self) -> None:
         """Refuses to replace the files of a run without its checkpoint, or of an older sejax."""
         for name in _SIGNS_OF_A_RUN:
             if (self.path / name).exists():
-                raise self._store.refused(
-                    f"must be new or hold the checkpoint of its run; got {self.path}, whose {name} "
-                    "would be replaced"
-                )
+                must = "must be new or hold the checkpoint of its run"
+                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a block."""
-        real_steps = np.asarray(info.real_steps, np.int64).sum(axis=1).cumsum() + self.real_steps
         others = {"seed", "env_steps_total", "wall_s"}
         values = {name: np.asarray(vars(info)[name]) for name in COLUMNS if name not in others}
-        values["env_steps_total"] = real_steps
+        steps = np.asarray(info.real_steps, np.int64).sum(axis=1)
+        values["env_steps_total"] = int(self.last("env_steps_total")) + steps.cumsum()
         for i, agent in enumerate(self._agents):
             for name in AGENT_COLUMNS:
                 values[f"{name}_{agent}"] = np.asarray(vars(info.by_agent)[name])[:, i]
@@ -260,33 +214,6 @@ class RunDirectory:
             path = self.path / name
             if not path.exists() or path.read_bytes() != text.encode():
                 write_text(path, text)
-
-
-def open_for(config: LearnConfig, hint: str = HINT) -> RunDirectory:
-    """The folder of a run; made, or opened to go on.
-
-    What it stores is compared as plain values: nothing that only the folder names is imported.
-
-    Args:
-      config: of the run.
-      hint: last sentence of messages: how to choose another folder.
-
-    Raises:
-      ConfigError: as of `RunDirectory`.
-    """
-    return RunDirectory(
-        config.resolved_run_dir,
-        configuration.plain(config),
-        config.scored_agents,
-        hint,
-        completed=lambda stored: configuration.completed(stored, config),
-    )
-
-
-def columns_of(agents: Sequence[str] = ()) -> tuple[str, ...]:
-    """The columns of `metrics.csv`: with several agents, four more for each of them."""
-    several = agents if len(agents) > 1 else ()
-    return COLUMNS + tuple(f"{name}_{agent}" for agent in several for name in AGENT_COLUMNS)
 
 
 def _as_text(value: np.generic) -> str:
@@ -315,21 +242,20 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
     Raises:
       ValueError: if the structure is another one.
     """
-    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
-    shapes = {_STATE + jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-    here = {name: _describe(jax.eval_shape(_bare, leaf)) for name, leaf in shapes.items()}
-    there = {name: _describe(array) for name, array in tensors.items()}
-    for name in [*here, *there]:
-        if there.get(name) != here.get(name):
-            found, expected = there.get(name, "missing"), here.get(name, "missing")
-            raise ValueError(f"{name} is {found}, and {expected} in this version")
-    arrays = [_as_leaf(tensors[name], leaf) for name, leaf in shapes.items()]
+    paths, structure = jax.tree_util.tree_flatten_with_path(like)
+    leaves = {_STATE + jax.tree_util.keystr(path): leaf for path, leaf in paths}
+    shapes = {name: jax.eval_shape(_bare, leaf) for name, leaf in leaves.items()}
+    for name in [*shapes, *tensors]:
+        there, here = _describe(tensors.get(name)), _describe(shapes.get(name))
+        if there != here:
+            raise ValueError(f"{name} is {there}, and {here} in this version")
+    arrays = [_as_leaf(tensors[name], leaf) for name, leaf in leaves.items()]
     state: State = jax.tree.unflatten(structure, arrays)
     return state
 
 
-def _describe(array: np.ndarray | jax.ShapeDtypeStruct) -> str:
-    return f"{array.dtype}{list(array.shape)}"
+def _describe(array: np.ndarray | jax.ShapeDtypeStruct | None) -> str:
+    return "missing" if array is None else f"{array.dtype}{list(array.shape)}"
 
 
 def _is_key(leaf: Array) -> bool:

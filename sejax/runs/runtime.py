@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import math
 import os
 import platform
 from importlib.metadata import version
@@ -15,27 +14,18 @@ from sejax.ops import files
 from sejax.options import require
 from sejax.training import require_modes
 
-CGROUPS = Path("/sys/fs/cgroup")
+QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: "200000 100000", or "max 100000"
 _NEVER_SECONDS = 1_000_000
 
 
 def available_cores() -> int:
     """CPU cores that this process may use: those it may run on, or fewer of a container's quota."""
-    affine = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
-    return max(1, int(min(cores, _quota(CGROUPS))))
-
-
-def _quota(cgroups: Path) -> float:
-    """CPUs that a container may use, as in `docker run --cpus=2`; inf where nothing is said."""
-    with contextlib.suppress(OSError, ValueError):  # version 2: "200000 100000", or "max 100000"
-        quota, period = (cgroups / "cpu.max").read_text().split()
-        return int(quota) / int(period)
+    is_affine = hasattr(os, "sched_getaffinity")
+    cores: float = len(os.sched_getaffinity(0)) if is_affine else os.cpu_count() or 1
     with contextlib.suppress(OSError, ValueError):
-        old = cgroups / "cpu"
-        quota, period = ((old / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-        return int(quota) / int(period) if int(quota) > 0 else math.inf
-    return math.inf
+        quota, period = map(int, QUOTA.read_text().split())
+        cores = min(cores, quota / period)
+    return max(1, int(cores))
 
 
 def is_started() -> bool:
@@ -45,14 +35,14 @@ def is_started() -> bool:
 
 def platform_error() -> str:
     """The message for a `JAX_PLATFORMS` that jax lacks, of which other code fails; else empty."""
-    asked = os.environ.get("JAX_PLATFORMS")
-    if not asked or is_started():
+    platforms = os.environ.get("JAX_PLATFORMS")
+    if not platforms or is_started():
         return ""
     try:
         jax.devices()
     except (RuntimeError, AssertionError):
         must = "must name what jax was installed for and finds here"
-        return f"JAX_PLATFORMS {must}; got {asked}. Set JAX_PLATFORMS=cpu."
+        return f"JAX_PLATFORMS {must}; got {platforms}. Set JAX_PLATFORMS=cpu."
     return ""
 
 
@@ -77,30 +67,13 @@ def configure_xla(num_devices: int | None = None) -> None:
         "--xla_cpu_collective_call_warn_stuck_timeout_seconds": _NEVER_SECONDS,
         "--xla_cpu_collective_call_terminate_timeout_seconds": _NEVER_SECONDS,
     }
-    given = os.environ.get("XLA_FLAGS", "")
-    added = [f"{flag}={value}" for flag, value in flags.items() if flag not in given]
-    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    users = os.environ.get("XLA_FLAGS", "")
+    added = [f"{flag}={value}" for flag, value in flags.items() if flag not in users]
+    os.environ["XLA_FLAGS"] = " ".join([users, *added]).strip()
     if count == 1:
         # With one device XLA would hand pieces of the step to a second thread, which doubles the
         # CPU time for no gain: the pieces are smaller than the handing over.
         os.environ.setdefault("NPROC", "1")
-
-
-def take_share_of_gpu(share: float) -> None:
-    """Keeps this process on its CPU core, or to its part of the GPU's memory.
-
-    Must run before jax first computes; after that nothing is done.
-
-    Args:
-      share: of one GPU, in [0, 1]; 0 for the CPU, whatever `JAX_PLATFORMS` says, so that other
-        processes have the GPUs.
-    """
-    if is_started():
-        return
-    if share == 0:
-        jax.config.update("jax_platforms", "cpu")
-    elif share < 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # its older name
-        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")  # 0.75 is usual
 
 
 def configure_jax() -> None:
@@ -140,9 +113,9 @@ def machine() -> dict[str, str | int]:
 
 def cpu_fingerprint() -> str:
     """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
-    kinds = ("model name", "flags", "Features")
-    described = sorted({x for x in _cpu_lines() if x.startswith(kinds)}) or [platform.processor()]
-    digest = hashlib.sha256("\n".join(described).encode()).hexdigest()[:12]
+    fields = ("model name", "flags", "Features")
+    lines = sorted({x for x in _cpu_lines() if x.startswith(fields)}) or [platform.processor()]
+    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
     return f"{platform.machine()}-{digest}"
 
 

@@ -6,83 +6,29 @@ import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
 
-from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.ops.parallel import compiler_options
+from sejax.bilevel import Bilevel, LearnState
 from sejax.proxies.header import agents_of
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.runs.workers import Chunks
 from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
 PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
 
 
-class Chunks:
-    """The generations of a learner in chunks, each length compiled once, ahead of time.
-
-    `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
-    the chunk before returned it.
-
-    Attributes:
-      learner: the functions of Algorithm 1.
-      cpu_s: CPU seconds of other processes than this one.
-    """
-
-    cpu_s = 0.0
-
-    def __init__(self, learner: Bilevel):
-        self.learner = learner
-        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
-        self._compiled: dict[int, Any] = {}  # by the length
-
-    def is_ready(self, length: int) -> bool:
-        """Whether a chunk of this length has been compiled."""
-        return length in self._compiled
-
-    def compile(self, length: int) -> None:
-        """Compiles a chunk of this length."""
-
-        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-            step = self.learner.generation
-            return jax.lax.scan(lambda state, _: step(state), state, length=length)
-
-        state = jax.eval_shape(self.init, jax.random.key(0))
-        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[length] = jitted.lower(state).compile()
-
-    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations; the buffers of the state are donated.
-
-        Returns:
-          The state, and an info with leaves `[length, ...]`.
-        """
-        if not self.is_ready(length):
-            self.compile(length)
-        state, info = self._compiled[length](state)
-        return state, info
-
-
-def make_chunks(config: LearnConfig) -> Chunks:
-    """The generations of a configuration, for all runs that differ from it in the seed."""
-    return Chunks(make_bilevel(**config.parts()))
-
-
 def run(
-    config: LearnConfig,
-    directory: RunDirectory,
-    chunks: Chunks,
-    report: Reporter | None = None,
+    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
 ) -> str:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
@@ -101,26 +47,24 @@ def run(
       OSError: if a file cannot be written; everything saved before is whole.
     """
     report, learner = report or Reporter(), chunks.learner
-    start_wall_s = directory.wall_s - time.monotonic()
+    start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
-    state, best_on_disk = _begin(config, directory, chunks, report)
-    tracked = TrackedRun(
-        folder=directory.path.resolve(),
-        id=directory.id,
-        generation=directory.finished_generations,
-        config=directory.config,
-    )
+    state = _begin(config, directory, chunks, report)
     drawn = time.monotonic()
-    with contextlib.closing(GuardedTracker(config.tracker, tracked, report.say)) as tracker:
+    folder, first = directory.path.resolve(), directory.finished_generations
+    tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
+    guarded = GuardedTracker(config.tracker, tracked, report.say)
+    with contextlib.closing(guarded) as tracker:
         while (ended := _ended(config, directory, learner, state)) is None:
-            left = config.generations - directory.finished_generations
-            state, info = _advance(chunks, state, min(config.checkpoint_every, left), report)
+            first = directory.finished_generations
+            length = min(config.checkpoint_every, config.generations - first)
+            state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
                 wall_s = start_wall_s + time.monotonic()
                 cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
                 rows = directory.save(saved, info, wall_s, cpu_s)
-                best_on_disk = save_proxies(directory, learner, saved, best_on_disk)
+                save_proxies(directory, learner, saved, first)
                 for generation in _finished(rows, info):
                     report.on_generation(generation)
                     tracker.on_generation(generation)
@@ -128,36 +72,42 @@ def run(
                 draw(directory, learner)
                 drawn = time.monotonic()
         draw(directory, learner)
+    generations, agents = directory.finished_generations, learner.strategy.num_evaluations
+    steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
         solved_score=learner.solved_score,
         wall_s=round(start_wall_s + time.monotonic(), 1),
         cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
-        **_costs(directory, learner),
-        **_machine(),
+        generations=generations,
+        agents=generations * agents,
+        train_steps=round(steps * agents),
+        real_steps=int(directory.last("env_steps_total")),
+        devices=[str(device) for device in jax.devices()],
+        machine=runtime.machine(),
+        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     )
     return ended
 
 
 def _begin(
     config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter
-) -> tuple[LearnState, int | None]:
-    """A new state or that of the folder, and the generation of the best proxy that is written."""
-    state, best_on_disk = chunks.init(jax.random.key(config.seed)), None
+) -> LearnState:
+    """A new state or that of the folder, beside which the proxies are written again."""
+    state = chunks.init(jax.random.key(config.seed))
     restored = directory.restore(state)
     if restored is not None:
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
-        here = runtime.versions()
-        if directory.versions != here:
-            made = f"It was made with {directory.versions}; here are {here}"
-            report.say(f"{made}. Numbers may move.")
+        here, there = runtime.versions(), directory.versions
+        if there != here:
+            report.say(f"It was made with {there}; here are {here}. Numbers may move.")
         # `stop_when_solved` may have changed.
         solved = jax.numpy.bool_(chunks.learner.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
-        best_on_disk = save_proxies(directory, chunks.learner, jax.device_get(state), None)
+        save_proxies(directory, chunks.learner, jax.device_get(state), 0)
     # Buffers of its own, so that they can be donated.
-    return jax.tree.map(lambda x: x.copy(), state), best_on_disk
+    return jax.tree.map(lambda x: x.copy(), state)
 
 
 def _ended(
@@ -175,7 +125,7 @@ def _advance(
     chunks: Chunks, state: LearnState, length: int, report: Reporter
 ) -> tuple[LearnState, GenerationInfo]:
     """Runs `length` generations, and returns when they are computed."""
-    if not chunks.is_ready(length):
+    if length not in chunks.compiled:
         report.status("compiling")
         chunks.compile(length)
         report.status("first generation")
@@ -186,31 +136,9 @@ def _advance(
     return state, info
 
 
-def _costs(directory: RunDirectory, learner: Bilevel) -> dict[str, int]:
-    """What all sessions of a run took, as counts."""
-    agents = learner.strategy.num_evaluations  # of a generation
-    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
-    return {
-        "generations": directory.finished_generations,
-        "agents": directory.finished_generations * agents,
-        "train_steps": round(steps_of_agents * agents),
-        "real_steps": directory.real_steps,
-    }
-
-
-def _machine() -> dict[str, Any]:
-    """Where this session has computed, and with what."""
-    return {
-        "devices": [str(device) for device in jax.devices()],
-        "machine": runtime.machine(),
-        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
-    }
-
-
 def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
     """Whether there are generations, and every agent of each met a number that is not finite."""
-    agents = learner.strategy.num_evaluations
-    rows = directory.rows
+    rows, agents = directory.rows, learner.strategy.num_evaluations
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
@@ -221,14 +149,12 @@ def interrupts_held() -> Iterator[None]:
     Within, files are being written, and jax's caches call back from weak references, where Python
     prints an exception and forgets it: the run would go on.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    is_main = threading.current_thread() is threading.main_thread()  # others hear no signals
     heard: list[int] = []
     handlers = {
         number: signal.signal(number, lambda number, frame: heard.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
-        if callable(signal.getsignal(number))
+        if is_main and callable(signal.getsignal(number))
     }
     try:
         yield
@@ -239,9 +165,7 @@ def interrupts_held() -> Iterator[None]:
         signal.raise_signal(heard[0])
 
 
-def save_proxies(
-    directory: RunDirectory, learner: Bilevel, state: LearnState, best_on_disk: int | None
-) -> int | None:
+def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, first: int) -> None:
     """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
     Where the search mean has diverged, the file before it stays.
@@ -250,16 +174,13 @@ def save_proxies(
       directory: of the run.
       learner: the functions of Algorithm 1.
       state: after the last generation that is saved, on the host.
-      best_on_disk: the generation of the best proxy that this session has written.
-
-    Returns:
-      The same after this call.
+      first: the first generation of which no proxy is written yet.
 
     Raises:
       OSError: if a file cannot be written.
     """
     if _all_diverged(directory, learner):
-        return best_on_disk
+        return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
     first_agent, names = learner.scoring.mixture.agents[0], learner.scoring.mixture.names
@@ -267,12 +188,12 @@ def save_proxies(
     # What was learned does not depend on the tracker, nor on where it was computed.
     config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
     for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
-        is_there = name == "proxy" and best_on_disk == generation
-        if is_there or not np.isfinite(flat).all():
+        path = directory.path / f"{name}.safetensors"
+        if (generation < first and path.exists()) or not np.isfinite(flat).all():
             continue
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
-            directory.path / f"{name}.safetensors",
+            path,
             learner.proxy,
             learner.unravel(flat),
             config,
@@ -282,7 +203,6 @@ def save_proxies(
             seed=directory.config["seed"],
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
-    return int(state.best_generation)
 
 
 def draw(directory: RunDirectory, learner: Bilevel) -> None:

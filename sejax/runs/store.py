@@ -8,7 +8,7 @@ moment leaves a whole entry, this one or the one before.
 import json
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
@@ -17,19 +17,8 @@ from sejax.ops.files import FolderLock, write_bytes
 from sejax.options import ConfigError
 from sejax.options.plain import differences
 
+Tensors: TypeAlias = Mapping[str, np.ndarray]  # by name
 KIND, FORMAT_VERSION = "sejax_run", 1  # of the files, since the first release
-
-
-class Entry(NamedTuple):
-    """What a store holds under a name.
-
-    Attributes:
-      tensors: arrays by name.
-      values: plain values by name.
-    """
-
-    tensors: dict[str, np.ndarray]
-    values: dict[str, Any]
 
 
 class Store:
@@ -51,8 +40,8 @@ class Store:
       >>> folder = Path(tempfile.mkdtemp())
       >>> with Store(folder, {"seed": 0}) as store:
       ...     store.put("rounds", {"x": np.arange(2)}, count=2)
-      >>> Store(folder, {"seed": 0}).get("rounds").values
-      {'count': 2}
+      >>> Store(folder, {"seed": 0}).get("rounds")
+      ({'x': array([0, 1])}, {'count': 2})
       >>> Store(folder, {"seed": 1}).get("rounds")  # doctest: +IGNORE_EXCEPTION_DETAIL
       Traceback (most recent call last):
       sejax.options.ConfigError: run_dir must be new ... seed (0 there, 1 here). Set run_dir=FOLDER.
@@ -75,7 +64,7 @@ class Store:
         self._lock: FolderLock | None = None
         self._is_used = False
 
-    def __enter__(self) -> "Store":
+    def __enter__(self) -> Self:
         self.lock()
         return self
 
@@ -95,18 +84,18 @@ class Store:
         if self._lock is not None:
             self._lock.release(self._is_used)
 
-    def path(self, name: str) -> Path:
+    def file(self, name: str) -> Path:
         """The file of an entry."""
         return self.folder / f"{name}.safetensors"
 
-    def get(self, name: str) -> Entry | None:
-        """An entry; None if there is none of this name.
+    def get(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """The tensors of an entry, and its plain values; None if there is none of this name.
 
         Raises:
           ConfigError: if it is damaged, or was made with other settings.
         """
         try:
-            tensors, values = checksummed.read(self.path(name), KIND)
+            tensors, values = checksummed.read(self.file(name), KIND)
             version, stored = values.pop("format_version"), dict(values.pop("config"))
             if version != FORMAT_VERSION:
                 raise ValueError(f"its format is {version}")
@@ -119,15 +108,11 @@ class Store:
         if differing:
             differing = differences(self._completed(stored), self.settings, self._free, most=3)
         if differing:
-            raise self.refused(
-                f"must be new or hold what was made with the same settings; got {self.folder}, "
-                f"which differs in {differing}"
-            )
-        return Entry(tensors, values)
+            must = "must be new or hold what was made with the same settings"
+            raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
+        return tensors, values
 
-    def put(
-        self, name: str, tensors: Mapping[str, np.ndarray] | None = None, **values: object
-    ) -> None:
+    def put(self, name: str, tensors: Tensors | None = None, **values: object) -> None:
         """Writes an entry over the one of this name.
 
         Args:
@@ -142,12 +127,10 @@ class Store:
         if self._lock is not None and not (self.folder / FolderLock.NAME).exists():
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
         manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
-        write_bytes(self.path(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
+        write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
         self._is_used = True
 
-    def once(
-        self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
-    ) -> dict[str, np.ndarray]:
+    def once(self, name: str, compute: Callable[[], Tensors]) -> dict[str, np.ndarray]:
         """The tensors of an entry, which are computed and written unless it is there.
 
         Raises:
@@ -155,16 +138,15 @@ class Store:
           OSError: as `put`.
         """
         entry = self.get(name)
-        if entry is not None:
-            return dict(entry.tensors)
-        tensors = dict(compute())
-        self.put(name, tensors)
+        tensors = dict(compute()) if entry is None else entry[0]
+        if entry is None:
+            self.put(name, tensors)
         return tensors
 
     def damaged(self, name: str, error: Exception) -> ConfigError:
         """The error for an entry that cannot be read, and why."""
         self._is_used = True
-        return self.refused(f"must hold whole files; got {self.path(name)}: {error}")
+        return self.refused(f"must hold whole files; got {self.file(name)}: {error}")
 
     def refused(self, message: str) -> ConfigError:
         """The error for a folder that cannot be used; the message follows its field."""

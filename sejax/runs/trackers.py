@@ -5,9 +5,10 @@ cannot stop it.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -89,28 +90,24 @@ class GuardedTracker:
         self._is_dropped = False
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        if self._is_dropped:
-            return
-        with self._guarded():
-            self._tracker = self._tracker or self._config.make(self._run)
-            self._tracker.on_generation(info)
+        self._call("on_generation", info)
 
     def close(self) -> None:
-        tracker, self._tracker = self._tracker, None
-        if tracker is not None and not self._is_dropped:
-            with self._guarded():
-                tracker.close()
+        if self._tracker is not None:
+            self._call("close")
 
-    @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
+    def _call(self, method: str, *arguments: FinishedGeneration) -> None:
+        if self._is_dropped:
+            return
         try:
-            yield
+            self._tracker = self._tracker or self._config.make(self._run)
+            getattr(self._tracker, method)(*arguments)
         except (Exception, SystemExit) as error:  # foreign code may raise anything
             self._is_dropped = True
             name = registry.name_of("tracker", self._config)
             self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
-            with contextlib.suppress(Exception, SystemExit):
-                if self._tracker is not None:
+            if method != "close" and self._tracker is not None:
+                with contextlib.suppress(Exception, SystemExit):
                     self._tracker.close()
 
 
@@ -118,14 +115,8 @@ class GuardedTracker:
 class NoTracker:
     """No tracker."""
 
-    def make(self, run: TrackedRun) -> "NoTracker":
-        return self
-
-    def on_generation(self, info: FinishedGeneration) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+    def make(self, run: TrackedRun) -> Tracker:
+        return SimpleNamespace(on_generation=lambda info: None, close=lambda: None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,40 +125,24 @@ class TensorBoardConfig:
 
     package: ClassVar[str] = "tensorboardX"
 
-    def make(self, run: TrackedRun) -> "TensorBoard":
-        return TensorBoard(run)
-
-
-class TensorBoard:
-    def __init__(self, run: TrackedRun):
+    def make(self, run: TrackedRun) -> Tracker:
         from tensorboardX import SummaryWriter
 
-        self._picture, self._next = run.picture, run.generation
         # Later generations of a killed session are purged. The suffix keeps its file from being
         # replaced by one that begins in the same second.
-        self._writer = SummaryWriter(
-            str(run.folder / "tensorboard"),
-            purge_step=run.generation,
-            filename_suffix=f".{run.generation}",
-        )
+        folder, suffix = str(run.folder / "tensorboard"), f".{run.generation}"
+        writer = SummaryWriter(folder, purge_step=run.generation, filename_suffix=suffix)
         text = yaml.safe_dump(run.config, sort_keys=False)
-        self._writer.add_text("config", f"```\n{text}```", run.generation)
+        writer.add_text("config", f"```\n{text}```", run.generation)
 
-    def on_generation(self, info: FinishedGeneration) -> None:
-        for name, value in info.values.items():
-            self._writer.add_scalar(name, value, info.generation)
-        if info.scores.size:
-            self._writer.add_histogram("population_scores", info.scores, info.generation)
-        self._writer.flush()
-        self._next = info.generation + 1
+        def on_generation(info: FinishedGeneration) -> None:
+            for name, value in info.values.items():
+                writer.add_scalar(name, value, info.generation)
+            if info.scores.size:
+                writer.add_histogram("population_scores", info.scores, info.generation)
+            writer.flush()
 
-    def close(self) -> None:
-        from PIL import Image
-
-        if self._picture.exists():
-            pixels = np.asarray(Image.open(self._picture).convert("RGB"))
-            self._writer.add_image("learning_curve", pixels, self._next, dataformats="HWC")
-        self._writer.close()
+        return SimpleNamespace(on_generation=on_generation, close=writer.close)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +152,7 @@ class WandbConfig:
     package: ClassVar[str] = "wandb"
     project: str = "sejax"
 
-    def make(self, run: TrackedRun) -> "Wandb":
+    def make(self, run: TrackedRun) -> Tracker:
         import wandb
 
         logged = wandb.init(
@@ -190,27 +165,11 @@ class WandbConfig:
             # The console belongs to the progress line; by default wandb waits 90 s for a network.
             settings=wandb.Settings(console="off", init_timeout=20),
         )
-        return Wandb(run, wandb, logged)
 
+        def on_generation(info: FinishedGeneration) -> None:
+            values: dict[str, Any] = {"generation": info.generation, **info.values}
+            if info.scores.size:
+                values["population_scores"] = wandb.Histogram(info.scores)
+            logged.log(values, step=info.generation)
 
-class Wandb:
-    """A run of Weights & Biases that has begun."""
-
-    def __init__(self, run: TrackedRun, module: Any, logged: Any):
-        self._picture, self._module, self._run = run.picture, module, logged
-        self._last = max(run.generation - 1, 0)
-
-    def on_generation(self, info: FinishedGeneration) -> None:
-        values: dict[str, Any] = {"generation": info.generation, **info.values}
-        if info.scores.size:
-            values["population_scores"] = self._module.Histogram(info.scores)
-        self._run.log(values, step=info.generation)
-        self._last = info.generation
-
-    def close(self) -> None:
-        if self._picture.exists():
-            # With the last generation: wandb drops what comes with a lower step than the last one,
-            # and a step of its own would be that of the generation where the run goes on.
-            picture = self._module.Image(str(self._picture))
-            self._run.log({"learning_curve": picture}, step=self._last)
-        self._run.finish()
+        return SimpleNamespace(on_generation=on_generation, close=logged.finish)

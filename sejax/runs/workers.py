@@ -1,13 +1,10 @@
-"""`machines=`: whether this process computes the trainings of a run, or workers on a Ray cluster.
+"""The generations of a run, compiled; and `machines=`: whether workers compute the trainings.
 
-The driver, this process, keeps the strategy, its state and all files. In each generation it sends
-candidates to the workers in shares, and outcomes come back. An outcome depends on its key and its
-candidate alone, so that the numbers are those of a single process whichever worker computes it. A
-share is a task of Ray: Ray starts workers where there is room, also on machines that join, and
-sends a share again whose worker died.
-
-Shares shrink towards the end of a generation (guided self-scheduling, Polychronopoulos and Kuck,
-1987), so that no worker waits long for the last one.
+With `machines=ray` the driver, this process, keeps the strategy, its state and all files. In each
+generation it sends candidates to workers on a Ray cluster, in shares, and outcomes come back. An
+outcome depends on its key and its candidate alone, so that the numbers are those of a single
+process whichever worker computes it. A share is a task of Ray: Ray starts workers where cores are
+free, also on machines that join, and sends a share again whose worker died.
 """
 
 import contextlib
@@ -20,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -31,28 +28,66 @@ from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Candidates, Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import (
-    ConfigError,
-    FailedError,
-    Options,
-    counts,
-    fraction,
-    option,
-    require,
-    shortened,
-    told,
-)
+from sejax.options import ConfigError, FailedError, Options, counts, option, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
-if TYPE_CHECKING:
-    from sejax.runs.session import Chunks
-
-CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
+Share: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
+CAPACITY = 16  # trainings in the largest shares, where batches follow one another
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
+
+
+class Chunks:
+    """The generations of a learner in chunks, each length compiled once, ahead of time.
+
+    `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
+    the chunk before returned it.
+
+    Attributes:
+      learner: the functions of Algorithm 1.
+      cpu_s: CPU seconds of other processes than this one.
+      compiled: the programs of chunks, by their lengths.
+    """
+
+    cpu_s = 0.0
+
+    def __init__(self, learner: Bilevel):
+        self.learner = learner
+        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
+        self.compiled: dict[int, Any] = {}
+
+    def compile(self, length: int) -> None:
+        """Compiles a chunk of this length."""
+
+        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
+            step = self.learner.generation
+            return jax.lax.scan(lambda state, _: step(state), state, length=length)
+
+        state = jax.eval_shape(self.init, jax.random.key(0))
+        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
+        self.compiled[length] = jitted.lower(state).compile()
+
+    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
+        """Runs `length` generations; the buffers of the state are donated.
+
+        Returns:
+          The state, and an info with leaves `[length, ...]`.
+        """
+        if length not in self.compiled:
+            self.compile(length)
+        state, info = self.compiled[length](state)
+        return state, info
+
+
+def make_chunks(config: LearnConfig) -> Chunks:
+    """The generations of a configuration, for all runs that differ from it in the seed."""
+    return Chunks(make_bilevel(**config.parts()))
+
+
+# --- machines= ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,22 +97,19 @@ class LocalConfig(Options):
     group: ClassVar[str] = "machines"
     is_elsewhere: ClassVar[bool] = False
 
-    def make(self, config: LearnConfig) -> contextlib.AbstractContextManager["Chunks"]:
+    def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
         """The compiled generations of a run."""
-        from sejax.runs import session  # which chooses how matplotlib draws
-
-        return contextlib.nullcontext(session.make_chunks(config))
+        return contextlib.nullcontext(make_chunks(config))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RayConfig(Options):
-    """Worker processes on a Ray cluster.
+    """Worker processes on a Ray cluster, each on a CPU core.
 
     Attributes:
       address: HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or
         local
-      workers: worker processes; null: one for each CPU core of the cluster, or for each GPU
-      gpus_per_worker: 0: a worker computes on a CPU core; 0.5: two workers share a GPU
+      workers: worker processes; null: one for each CPU core of the cluster
     """
 
     group: ClassVar[str] = "machines"
@@ -86,7 +118,6 @@ class RayConfig(Options):
 
     address: str | None = None
     workers: int | None = option(None, counts("somebody must compute"))
-    gpus_per_worker: float = option(0.0, fraction())
 
     @contextlib.contextmanager
     def make(self, config: LearnConfig) -> Iterator["RemoteChunks"]:
@@ -95,126 +126,93 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        runtime.take_share_of_gpu(0)  # GPUs are the workers'
-        learner = make_bilevel(**config.parts() | {"devices": 1})
-        with _connected(self):
-            batches = batches_of(config, learner, self, num_workers(self))
-            setup = setup_of(config, batches, self.gpus_per_worker)
-            compute = functools.partial(_on_cluster, self, setup)
-            yield RemoteChunks(learner, batches, lambda: num_workers(self), compute)
+        import ray  # of an extra
+
+        _use_one_core()
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        quiet = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
+        try:
+            with warnings.catch_warnings():  # Ray's processes do not go on with jax
+                warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+                ray.init(self.address, **quiet)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            must = "machines.address must be a cluster that can be reached"
+            fix = "Start one with ray start --head, or set machines.address=local."
+            message = f"{must}; got {self.address} ({told(error)}). {fix}"
+            raise ConfigError(message, "machines.address") from error
+        compute = functools.partial(_on_cluster, self, setup_of(config))
+        try:
+            yield RemoteChunks(config, functools.partial(num_workers, self), compute)
+        finally:
+            ray.shutdown()
 
 
 # --- shares of a generation -----------------------------------------------------------------------
 
 
-class Batch(NamedTuple):
-    """How the trainings of one agent are computed.
+def sizes_of(learner: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
+    """Trainings of each agent in a batch, and most of them in a share, which is whole batches.
 
-    Attributes:
-      capacity: most trainings in a share.
-      width: trainings that are computed together, so that one takes as long as all of them.
+    They are the same for any number of workers, because sums over batches of other widths round
+    otherwise.
     """
-
-    capacity: int
-    width: int
-
-
-def batches_of(
-    config: LearnConfig, learner: Bilevel, machines: RayConfig, num_first: int
-) -> list[Batch]:
-    """The batches of each agent's trainings.
-
-    On a CPU they are the same for any number of workers, because sums over batches of other widths
-    round otherwise. A worker with a GPU computes its part of a generation at once.
-    """
-    batches = []
-    for size, cpu_width in zip(learner.evaluate.sizes, learner.evaluate.widths, strict=True):
-        if machines.gpus_per_worker:
-            capacity, width = -(-size // num_first), config.num_parallel
-        else:
-            capacity, width = CAPACITY, config.num_parallel or cpu_width
-        width = width or capacity
-        batches.append(Batch(width * -(-capacity // width), width))
-    return batches
+    widths = [num_parallel or width or CAPACITY for width in learner.evaluate.widths]
+    return [(width, width * -(-CAPACITY // width)) for width in widths]
 
 
-def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarray]:
-    """Shares of the places, each half of what is left to each worker, in whole batches."""
-    while len(places):
-        size = batch.width * -(-len(places) // (2 * num_workers * batch.width))
-        size = min(size, batch.capacity)
-        yield places[:size]
-        places = places[size:]
-
-
-class Share(NamedTuple):
-    """Trainings of one agent.
-
-    Attributes:
-      agent: its index.
-      trainings: leaves `[n, ...]` of NumPy, the keys as data.
-    """
-
-    agent: int
-    trainings: Trainings
-
-
-class RemoteChunks:
-    """In the place of `sejax.runs.session.Chunks`: the trainings are sent to workers.
+class RemoteChunks(Chunks):
+    """Generations whose trainings are sent to workers.
 
     `ask` and `tell` stay here. The state after a generation equals that of `Bilevel.generation` to
     the last bit, if the workers' CPUs are of this one's kind.
 
     Args:
-      learner: the functions of Algorithm 1.
-      batches: of each agent.
+      config: of the run.
       num_workers: workers that there are now.
       compute: what `score` returns for each share, in their order.
 
     Attributes:
-      learner: the functions of Algorithm 1.
       cpu_s: CPU seconds of the workers in trainings.
     """
 
     def __init__(
         self,
-        learner: Bilevel,
-        batches: Sequence[Batch],
+        config: LearnConfig,
         num_workers: Callable[[], int],
         compute: Callable[[Sequence[Share]], Sequence[tuple[Outcome, float]]],
     ):
-        self.learner, self.cpu_s = learner, 0.0
-        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
+        super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._num_workers, self._compute = num_workers, compute
-        self._batches = batches
-        self._compiled: Any = None
-
-    def is_ready(self, length: int) -> bool:
-        """Whether this process's part is compiled, which it is for chunks of any length."""
-        return self._compiled is not None
+        self._sizes = sizes_of(self.learner, config.num_parallel)
 
     def compile(self, length: int) -> None:
-        """Compiles `ask` and `tell`.
+        """Compiles `ask` and `tell`, of which chunks of any length are made."""
+        self.compiled[length] = self._programs
+
+    @functools.cached_property
+    def _programs(self) -> tuple[Any, list[Outcome]]:
+        """The program of `ask` and `tell`, and the outcomes with which it asks.
 
         Both are one program that runs twice in a generation: in a program of its own XLA would
         round the candidates of `ask` otherwise than in `Bilevel.generation`.
         """
+        learner = self.learner
 
         def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
-            candidates = self.learner.ask(state)
-            outcome = self.learner.evaluate.joined(by_agent)
-            return self.learner.tell(state, candidates, outcome), _sent(self.learner, candidates)
+            candidates = learner.ask(state)
+            outcome = learner.evaluate.joined(by_agent)
+            return learner.tell(state, candidates, outcome), _sent(learner, candidates)
 
         def evaluate(state: LearnState) -> list[Outcome]:
-            trainings = self.learner.evaluate.trainings(self.learner.ask(state))
-            pairs = zip(self.learner.evaluate.runs, trainings, strict=True)
+            trainings = learner.evaluate.trainings(learner.ask(state))
+            pairs = zip(learner.evaluate.runs, trainings, strict=True)
             return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
 
-        state = jax.eval_shape(self.learner.init, jax.random.key(0))
+        state = jax.eval_shape(learner.init, jax.random.key(0))
         shapes = jax.eval_shape(evaluate, state)
-        self._no_outcomes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        no_outcomes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        self._compiled = jitted.lower(state, self._no_outcomes).compile()
+        return jitted.lower(state, no_outcomes).compile(), no_outcomes
 
     def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
         """Runs `length` generations.
@@ -225,30 +223,30 @@ class RemoteChunks:
         Raises:
           FailedError: if a worker fails, or the whole cluster is lost.
         """
-        if not self.is_ready(length):
-            self.compile(length)
+        generation, no_outcomes = self._programs
         infos = []
         for _ in range(length):
-            _, trainings = self._compiled(state, self._no_outcomes)
+            _, trainings = generation(state, no_outcomes)
             outcomes = self._evaluate(jax.device_get(trainings))
-            (state, info), _ = self._compiled(state, outcomes)
+            (state, info), _ = generation(state, outcomes)
             infos.append(info)
-        return state, jax.tree.map(lambda *each: jnp.stack(each), *infos)
+        return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *infos)
 
     def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
         """The outcomes of each agent's trainings, leaves `[training, ...]`."""
-        num_workers = self._num_workers()
-        shares = [
-            Share(agent, jax.tree.map(lambda x, places=places: x[places], trainings))
-            for agent, (trainings, batch) in enumerate(zip(by_agent, self._batches, strict=True))
-            for places in cut(np.arange(len(trainings.active)), batch, num_workers)
-        ]
-        outcomes, cpu_s = zip(*self._compute(shares), strict=True)
-        self.cpu_s += sum(cpu_s)
+        shares: list[Share] = []
+        for agent, (trainings, (width, most)) in enumerate(zip(by_agent, self._sizes, strict=True)):
+            total = len(trainings.active)
+            # Two shares for each worker, so that none waits long for the last one.
+            size = min(most, width * -(-total // (2 * self._num_workers() * width)))
+            for start in range(0, total, size):
+                part = slice(start, start + size)
+                shares.append((agent, jax.tree.map(lambda x, part=part: x[part], trainings)))
         parts: list[list[Outcome]] = [[] for _ in by_agent]
-        for share, outcome in zip(shares, outcomes, strict=True):
-            parts[share.agent].append(outcome)
-        return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *some) for some in parts]
+        for (agent, _), (outcome, cpu_s) in zip(shares, self._compute(shares), strict=True):
+            parts[agent].append(outcome)
+            self.cpu_s += cpu_s
+        return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
 
 
 def _sent(learner: Bilevel, candidates: Candidates) -> list[Trainings]:
@@ -262,33 +260,6 @@ def _sent(learner: Bilevel, candidates: Candidates) -> list[Trainings]:
 # --- the cluster ----------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _connected(machines: RayConfig) -> Iterator[None]:
-    """A connection to the cluster.
-
-    Raises:
-      ConfigError: if it cannot be reached.
-    """
-    import ray  # of an extra
-
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    quiet = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
-    try:
-        with warnings.catch_warnings():  # Ray's processes do not go on with jax
-            warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-            ray.init(machines.address, **quiet)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise ConfigError(
-            f"machines.address must be a cluster that can be reached; got {machines.address} "
-            f"({told(error)}). Start one with ray start --head, or set machines.address=local.",
-            "machines.address",
-        ) from error
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
 def num_workers(machines: RayConfig) -> int:
     """The workers that are asked for, or that the cluster's machines have room for now.
 
@@ -297,19 +268,13 @@ def num_workers(machines: RayConfig) -> int:
     """
     import ray  # of an extra
 
-    own = ray.get_runtime_context().get_node_id()
-    if not any(node["NodeID"] == own and node["Alive"] for node in ray.nodes()):
+    here = ray.get_runtime_context().get_node_id()
+    if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
         raise FailedError(
             "Ray has ended on this machine, so that no training can be sent out. The generations "
             "before are saved; start Ray and repeat the command to go on."
         )
-    if machines.workers:
-        return machines.workers
-    resources = ray.cluster_resources()
-    room = resources.get("CPU", 0.0)
-    if machines.gpus_per_worker:
-        room = min(room, resources.get("GPU", 0.0) / machines.gpus_per_worker)
-    return max(1, int(room))
+    return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
 def _on_cluster(
@@ -322,9 +287,7 @@ def _on_cluster(
     """
     import ray  # of an extra
 
-    gpus = machines.gpus_per_worker
-    # By default Ray ends a process after a task that has a GPU, and all that it has compiled.
-    task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES, max_calls=0)(score)
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(score)
     most, tasks, running = num_workers(machines), [], []
     for i, share in enumerate(shares, 1):
         tasks.append(task.remote(setup, share))
@@ -347,13 +310,12 @@ def _on_cluster(
 # --- a worker -------------------------------------------------------------------------------------
 
 
-def setup_of(config: LearnConfig, batches: Sequence[Batch], gpu_share: float) -> str:
+def setup_of(config: LearnConfig) -> str:
     """What a worker must know of a run, as JSON: a text, by which it keeps what it has compiled."""
+    plain = configuration.plain(config)
     # A worker need not have what it has no use for.
-    plain = {
-        k: v for k, v in configuration.plain(config).items() if k not in ("tracker", "machines")
-    }
-    return json.dumps([plain, [x.capacity for x in batches], gpu_share, runtime.versions()])
+    needed = {name: x for name, x in plain.items() if name not in ("tracker", "machines")}
+    return json.dumps([needed, runtime.versions()])
 
 
 def score(setup: str, share: Share) -> tuple[Outcome, float]:
@@ -362,52 +324,45 @@ def score(setup: str, share: Share) -> tuple[Outcome, float]:
     Raises:
       ConfigError: if this machine has other versions of what decides the numbers.
     """
-    capacity, program = _programs(setup)[share.agent]
-    started, n = time.process_time(), len(share.trainings.active)
+    (agent, trainings), started = share, time.process_time()
+    capacity, program = _programs(setup)[agent]
     # Filled up with copies, for which nothing is computed.
-    places, is_own = np.minimum(np.arange(capacity), n - 1), np.arange(capacity) < n
-    trainings = jax.tree.map(lambda x: x[places], share.trainings)
-    outcome = program(dataclasses.replace(trainings, active=trainings.active & is_own))
+    n, numbers = len(trainings.active), np.arange(capacity)
+    trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
+    outcome = program(dataclasses.replace(trainings, active=trainings.active & (numbers < n)))
     outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
     return outcome, time.process_time() - started
 
 
 @functools.lru_cache(maxsize=1)
 def _programs(setup: str) -> list[tuple[int, Any]]:
-    """Most evaluations in a share, and their compiled program, for each agent of a run."""
-    plain, capacities, gpu_share, expected = json.loads(setup)
-    runtime.configure_xla(1)
-    runtime.take_share_of_gpu(gpu_share)
-    versions = runtime.versions()
-    require(
-        versions == expected,
-        "machines",
-        f"must have the same versions everywhere; got {versions} on {socket.gethostname()} and "
-        f"{expected} here. Set the same versions up there.",
-    )
+    """Most trainings in a share, and the program that computes them, for each agent of a run."""
+    plain, expected = json.loads(setup)
+    _use_one_core()
+    if (versions := runtime.versions()) != expected:
+        got = f"{versions} on {socket.gethostname()} and {expected} here"
+        must = f"machines must have the same versions everywhere; got {got}"
+        raise ConfigError(f"{must}. Set the same versions up there.", "machines")
     runtime.configure_jax()
     config = configuration.learn_config(plain)
     learner = make_bilevel(**config.parts() | {"devices": 1})
-    return [
-        (capacity, _compiled_share(learner, agent, capacity, config.num_parallel))
-        for agent, capacity in enumerate(capacities)
-    ]
+
+    def program_of(agent: int, width: int) -> Any:
+        spread = spread_over_devices(learner.evaluate.runs[agent], 1, width)
+
+        def evaluate(sent: Trainings) -> Outcome:
+            key = jax.random.wrap_key_data(sent.key)
+            outcome: Outcome = spread(dataclasses.replace(sent, key=key))
+            return outcome
+
+        return jax.jit(evaluate, compiler_options=compiler_options())
+
+    sizes = sizes_of(learner, config.num_parallel)
+    return [(capacity, program_of(agent, width)) for agent, (width, capacity) in enumerate(sizes)]
 
 
-def _compiled_share(learner: Bilevel, agent: int, capacity: int, num_parallel: int | None) -> Any:
-    """The program that evaluates up to `capacity` trainings of an agent."""
-    run, cpu_width = learner.evaluate.runs[agent], learner.evaluate.widths[agent]
-    spread = spread_over_devices(run, 1, num_parallel, cpu_width)
-
-    def evaluate(sent: Trainings) -> Outcome:
-        key = jax.random.wrap_key_data(sent.key)
-        outcome: Outcome = spread(dataclasses.replace(sent, key=key))
-        return outcome
-
-    def example(key: Array) -> Trainings:
-        sent = _sent(learner, learner.ask(learner.init(key)))[agent]
-        filled: Trainings = jax.tree.map(lambda x: x[np.zeros(capacity, int)], sent)
-        return filled
-
-    shapes = jax.eval_shape(example, jax.random.key(0))
-    return jax.jit(evaluate, compiler_options=compiler_options()).lower(shapes).compile()
+def _use_one_core() -> None:
+    """Keeps this process on one CPU core, whatever else there is; before jax first computes."""
+    runtime.configure_xla(1)
+    if not runtime.is_started():
+        jax.config.update("jax_platforms", "cpu")

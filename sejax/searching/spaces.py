@@ -13,19 +13,19 @@
 A YAML file of a space maps fields to these, and under `with_agent` agents to ranges of their own.
 """
 
+import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna import distributions
 
-from sejax.options import ConfigError, as_text, nearest, shortened, told
+from sejax.options import ConfigError, as_text, nearest, require, shortened, told
 from sejax.options.plain import split
 
-Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a number: the override says exactly what was tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
@@ -45,7 +45,7 @@ class Dimension:
 
     name: str
     text: str
-    distribution: Distribution
+    distribution: distributions.BaseDistribution
     is_inverse: bool = False
 
     @property
@@ -60,21 +60,22 @@ class Dimension:
             value = f"{1 - value if self.is_inverse else value:.{DIGITS}g}"
         return str(value)
 
-    def parameter_of(self, value: object) -> object:
+    def parameter_of(self, value: Any) -> Any:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
-        drawn = self.distribution
-        if isinstance(drawn, CategoricalDistribution):
-            return as_text(value) if as_text(value) in drawn.choices else None
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        try:
+            if isinstance(self.distribution, distributions.CategoricalDistribution):
+                value = as_text(value)
+            elif self.is_inverse:
+                value = round(1 - value, 12)
+            is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
+        except (TypeError, ValueError):
             return None
-        number = round(1 - value, 12) if self.is_inverse else value
-        is_step = isinstance(drawn, FloatDistribution) or (number - drawn.low) % drawn.step == 0
-        return number if is_step and drawn.low <= number <= drawn.high else None
+        return value if is_held else None
 
 
 def is_range(text: str) -> bool:
-    """Whether the value of an override is searched."""
-    return _CALL.fullmatch(text) is not None
+    """Whether the value of an override is searched; a comma makes a sweep elsewhere."""
+    return _CALL.fullmatch(text) is not None or len(split(text)) > 1
 
 
 def parse(name: str, text: str) -> Dimension:
@@ -87,49 +88,40 @@ def parse(name: str, text: str) -> Dimension:
       >>> parse("agent.num_layers", "int(interval(1, 2))").distribution
       IntDistribution(high=2, log=False, low=1, step=1)
     """
-    call, tags = text.strip(), set[str]()
-    if (tagged := _CALL.fullmatch(call)) and tagged[1] == "tag":
-        *given, call = split(tagged[2])
-        tags = set(given)
+    tagged = re.fullmatch(r"tag\((.*)\)", text.strip())
+    *tags, call = split(tagged[1]) if tagged else [text.strip()]
     try:
         distribution = _distribution(call, tags)
     except (LookupError, TypeError, ValueError, ZeroDivisionError) as error:  # also of Optuna
-        raise ConfigError(
-            f"{name} must be a choice, a range or an interval; got {shortened(text)} "
-            f"({told(error)}). Set {name}='{EXAMPLE}'.",
-            name,
-        ) from error
+        must = f"must be a choice, a range or an interval; got {shortened(text)} ({told(error)})"
+        raise ConfigError(f"{name} {must}. Set {name}='{EXAMPLE}'.", name) from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
 
 
-def _distribution(text: str, tags: Collection[str]) -> Distribution:
+def _distribution(text: str, tags: list[str]) -> distributions.BaseDistribution:
     """Optuna's distribution of a range without its tags.
 
     Raises:
-      ValueError: if it is none.
+      LookupError, TypeError, ValueError, ZeroDivisionError: if it is none.
     """
     call = _CALL.fullmatch(text)
     kind, inner = (call[1], call[2]) if call else ("choice", text)
-    log, is_inverse = "log" in tags, "inverse" in tags
-    if set(tags) not in ({"log", "inverse"}, {"log"}, set()):
-        raise ValueError("tags are log, or log and inverse")
-    if kind == "interval":
-        low, high = map(float, split(inner))
-        if is_inverse:
-            low, high = round(1 - high, 12), round(1 - low, 12)
-        if not float("-inf") < low <= high < float("inf"):
-            raise ValueError("bounds are finite and grow")
-        return FloatDistribution(low, high, log=log)
-    if kind == "int" and (interval := re.fullmatch(r"interval\((.*)\)", inner)):
-        first, last = map(int, split(interval[1]))
-        return IntDistribution(first, last, log=log)
-    if kind == "range" and not tags:
-        whole = range(*map(int, split(inner)))
-        return IntDistribution(whole[0], whole[-1], step=whole.step)
-    choices = split(inner)
-    if kind != "choice" or tags or "" in choices or (call is None and len(choices) < 2):
-        raise ValueError(f"{kind} takes other values, or no tags")
-    return CategoricalDistribution(choices)
+    match kind, tags:
+        case "interval", [] | ["log"] | ["log", "inverse"]:
+            low, high = map(float, split(inner))
+            if "inverse" in tags:
+                low, high = round(1 - high, 12), round(1 - low, 12)
+            if -math.inf < low <= high < math.inf:
+                return distributions.FloatDistribution(low, high, log=bool(tags))
+        case "int", [] | ["log"]:
+            first, last = split(inner.removeprefix("interval(").removesuffix(")"))
+            return distributions.IntDistribution(int(first), int(last), log=bool(tags))
+        case "range", []:
+            whole = range(*map(int, split(inner)))
+            return distributions.IntDistribution(whole[0], whole[-1], step=whole.step)
+        case "choice", [] if "" not in split(inner) and (call or len(split(inner)) > 1):
+            return distributions.CategoricalDistribution(split(inner))
+    raise ValueError("bounds, tags or values are wrong")
 
 
 def names() -> list[str]:
@@ -146,22 +138,28 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
         `agents.KEY`, where what agents share has no ranges.
 
     Raises:
-      ConfigError: if it is not there, or is no such file.
+      ConfigError: if it is not there, or is no such file, or names a `module:attribute`.
     """
     path = Path(name) if name.endswith(".yaml") else FOLDER / f"{name}.yaml"
     try:
-        ranges = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
-        with_agent = dict(ranges.pop("with_agent", None) or {})
-        of_agents = {agent: dict(x) for agent, x in with_agent.items()}
-    except (OSError, yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
-        ranked = nearest(name, names())
-        raise ConfigError(
-            f"space must be one of {', '.join(ranked)}, or a YAML file that maps fields to ranges; "
-            f"got {shortened(name)} ({told(error)[:120]}). Set space={ranked[0]}.",
-            "space",
-        ) from error
-    for group, agent in agents.items():
-        for field, text in of_agents.get(agent, {}).items():
-            if group == "agent" or str(field).startswith("agent."):
-                ranges[str(field).replace("agent", group, 1)] = text
-    return {str(field): parse(str(field), str(text)) for field, text in ranges.items()}
+        texts = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
+        with_agent = texts.pop("with_agent", None) or {}
+        for group, agent in agents.items():
+            for field, text in with_agent.get(agent, {}).items():
+                if group == "agent" or field.startswith("agent."):
+                    texts[field.replace("agent", group, 1)] = text
+    except (
+        OSError,
+        yaml.YAMLError,
+        AttributeError,
+        TypeError,
+        ValueError,
+        RecursionError,
+    ) as error:
+        must = f"must be one of {', '.join(nearest(name, names()))}, or a YAML file of ranges"
+        got = f"{shortened(name)} ({told(error)[:120]})"
+        raise ConfigError(f"space {must}; got {got}. Set space=paper_se.", "space") from error
+    foreign = [text for text in texts.values() if ":" in str(text)]
+    must = f"must name no module, as a file may not; got {shortened(', '.join(foreign))}"
+    require(not foreign, "space", f"{must}. Type this range on the command line.")
+    return {str(field): parse(str(field), str(text)) for field, text in texts.items()}
