@@ -18,7 +18,7 @@ from sejax.agents import sac
 from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SLOW = ("own_objective", "read_a_set", "suite_reward_network")
+SLOW = ("own_objective", "read_a_set", "other_suites")
 TINY = {
     "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],
@@ -26,8 +26,8 @@ TINY = {
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
     "read_a_set": ["--agents=3", "--size=2", "--generations=2"],
-    "suite_reward_network": ["gymnax/Catch-bsuite", "--solved=0.8", "--generations=1",
-                             "--population=2", "--agents=2", "--steps=30"],
+    "other_suites": ["env=gymnax/Catch-bsuite", "env.solved_reward=0.8", "generations=1",
+                     "es.population_size=2", "training.max_steps=30"],
     "train_thousands": ["--agents=6", "--num_parallel=2"],
     "sb3_agents": ["--steps=10", "--seeds=1", "--episodes=1"],
     "sbx_agent": ["--steps=10", "--seeds=1", "--episodes=1"],
@@ -44,7 +44,7 @@ PRINTS = {
     "own_objective": r"MaxReward: mean return .*\nRiskAverse: mean return",
     "own_proxy": r"linear_cartpole\.safetensors: best \d+, 35 weights",
     "read_a_set": r"seed 0, .*3 fresh agents return .*\nseed 1,",
-    "suite_reward_network": r"with the RN: \d of 2 agents .*\nwithout it: \d of 2 agents",
+    "other_suites": r"with the RN: \d of 8 agents .*\nwithout it: \d of 8 agents",
     "train_thousands": r"proxy: 6 agents .*\n.*test return -12\.0\nreal task: 6 agents",
     "sb3_agents": r"(?s)cartpole  PPO +\d+\.0 ± 0.*DQN.*acrobot   PPO.*DQN +-\d+\.0 ± 0.0 +-\d",
     "sbx_agent": r"after 10 steps on the SE: \d+\n.*on CartPole: \d+\n",
