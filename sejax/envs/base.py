@@ -85,7 +85,11 @@ class Task(TaskSpec):
             "if it is undefined.",
         )
         with _one_error(name):
-            params, max_steps = _with_limit(env, params, max_steps)
+            params = env.default_params if params is None else params
+            limit = params.max_steps_in_episode if max_steps is None else max_steps
+            options.counts()("env.max_steps", max_steps := options.as_python(limit), 200)
+            if params.max_steps_in_episode != max_steps:
+                params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)
             vectors, observation, action = as_vectors(env, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
@@ -93,7 +97,7 @@ class Task(TaskSpec):
         super().__init__(
             observation=observation,
             action=action,
-            max_steps=max_steps,
+            max_steps=int(max_steps),
             solved_reward=solved_reward,
             info_keys=info_keys,
             augmented_keys=augmented_keys,
@@ -104,14 +108,8 @@ class Task(TaskSpec):
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
         """The task of an environment that has the spec's spaces."""
-        return cls(
-            name=name,
-            env=env,
-            max_steps=spec.max_steps,
-            solved_reward=spec.solved_reward,
-            info_keys=spec.info_keys,
-            augmented_keys=spec.augmented_keys,
-        )
+        names = ("max_steps", "solved_reward", "info_keys", "augmented_keys")
+        return cls(name=name, env=env, **{field: getattr(spec, field) for field in names})
 
 
 def require_own_steps(env: Environment) -> None:
@@ -130,19 +128,6 @@ def require_own_steps(env: Environment) -> None:
         "must change reset_env and step_env in place of reset and step; got "
         f"{type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper.",
     )
-
-
-def _with_limit(
-    env: Environment, params: EnvParams | None, max_steps: int | None
-) -> tuple[EnvParams, int]:
-    """Params that have the step limit, and the limit."""
-    default = env.default_params
-    params = default if params is None else params
-    limit = options.as_python(params.max_steps_in_episode if max_steps is None else max_steps)
-    options.counts()("env.max_steps", limit, 200)
-    if params.max_steps_in_episode != limit:
-        params = dataclasses.replace(params, max_steps_in_episode=limit)
-    return params, int(limit)
 
 
 @contextlib.contextmanager

@@ -44,8 +44,8 @@ class GymnaxTask(Options):
         options.require(
             self.name.startswith(PREFIX),
             "env",
-            f"must be one of gymnax; got {options.shortened(self.name)}. Other suites are an example "
-            "now: set env=other_suites:task in its folder, examples/.",
+            f"must be one of gymnax; got {options.shortened(self.name)}. Other suites are in an "
+            "example now. Set env=other_suites:task in the folder examples/.",
         )
         import gymnax
         from gymnax.registration import registered_envs
