@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -23,6 +23,7 @@ from sejax.proxies.synthetic import SyntheticConfig
 
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
+LIMIT = np.float32(MAX_ABS_VALUE)
 Numbers = np.ndarray | float
 
 
@@ -76,8 +77,8 @@ class SyntheticWorld:
         self._start_layers = networks.layers_of(weights, "start")
         heads = [networks.layers_of(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
-        fix = "got None. Set RealTask(starts=...)."
-        require(self.draws_noise or task.starts, "task.starts", f"must draw initial states; {fix}")
+        must = "must draw initial states; got None. Set RealTask(starts=...)."
+        require(self.draws_noise or task.starts, "task.starts", must)
         self._starts: Any = task.starts  # not None if it is called
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 
@@ -98,7 +99,7 @@ class SyntheticWorld:
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
         vector = vector if self._units is None else self._units.decode(vector)
-        return np.minimum(np.maximum(vector, np.float32(-MAX_ABS_VALUE)), np.float32(MAX_ABS_VALUE))
+        return np.minimum(np.maximum(vector, -LIMIT), LIMIT)
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
@@ -111,12 +112,12 @@ class SyntheticWorld:
         Raises:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
-        if isinstance(self.action_space, spaces.Discrete):
-            if not space.shape and space.contains(action):
+        if isinstance(space, spaces.Discrete):
+            if space.contains(action):
                 return self._one_hot[int(action)]
+        elif isinstance(self.action_space, spaces.Discrete):
             array = np.asarray(action)  # also of bools, which would be a mask
-            is_whole = array.shape == space.shape and array.dtype.kind in "biu"
-            if space.shape and is_whole and space.contains(array):
+            if array.dtype.kind in "biu" and space.contains(array):
                 return self._one_hot[array.astype(np.intp)]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
@@ -239,10 +240,6 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         info = {"discount": float(step.discount)}
         return self.world.observe(step.vector), float(step.reward), terminated, truncated, info
 
-    def render(self) -> NoReturn:
-        """Raises `NotImplementedError`: the states of an SE have no picture."""
-        raise NotImplementedError("an SE's states have no picture: render its real task")
-
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """Episodes of an SE as a Gymnasium vector environment.
@@ -264,9 +261,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        if not isinstance(autoreset_mode, AutoresetMode):
-            one_of([mode.value for mode in AutoresetMode])("autoreset_mode", autoreset_mode, None)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        one_of([x.value for x in AutoresetMode])("autoreset_mode", mode, None)
+        self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space
@@ -296,15 +293,13 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         Raises:
           ConfigError: for seeds or a mask of another length.
         """
-        n = self.num_envs
-        seeds = seed
+        n, seeds = self.num_envs, seed
         if seeds is None or isinstance(seeds, int | np.integer):
             seeds = [None if seeds is None else int(seeds) + i for i in range(n)]
         mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
         require(len(seeds) == n, "seed", f"must be one number, or {n}; got {len(seeds)}.")
-        is_mask = mask.shape == (n,) and mask.dtype == np.bool_
-        got = f"{mask.shape} of {mask.dtype}"
-        require(is_mask, "options.reset_mask", f"must be [{n}] of bool; got {got}.")
+        got, wanted = f"{mask.dtype}{list(mask.shape)}", f"bool[{n}]"
+        require(got == wanted, "options.reset_mask", f"must be {wanted}; got {got}.")
         for i in np.flatnonzero(mask).tolist():
             if self._np_random[i] is None or seeds[i] is not None:
                 self._np_random[i], self._np_random_seed[i] = seeding.np_random(seeds[i])
@@ -321,8 +316,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
           gymnasium.error.ResetNeeded: if an environment has no episode that goes on.
           gymnasium.error.InvalidAction: for actions that are none of the space's.
         """
-        is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        if None in self._np_random or (self._ended.any() and not is_next_step):
+        begins_itself = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        if None in self._np_random or (self._ended.any() and not begins_itself):
             raise ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
         on = ~self._ended  # the others begin an episode
@@ -340,19 +335,13 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._ended = ended = terminated | truncated
         infos = _told(discounts, on)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos = self._finals(ended, discounts)
+            obs, final_obs = self.world.observe(self._vectors), np.full(self.num_envs, None)
+            for i in np.flatnonzero(ended):
+                final_obs[i] = obs[i]
+            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
+            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
             self._begin(ended)
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
-
-    def _finals(self, ended: np.ndarray, discounts: np.ndarray) -> Info:
-        """Infos of a step whose ended environments begin anew at once."""
-        obs = self.world.observe(self._vectors)
-        final_obs = np.full(self.num_envs, None)
-        for i in np.flatnonzero(ended):
-            final_obs[i] = obs[i]
-        finals = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-        masks = {"_final_obs": ended, "_final_info": ended}
-        return finals | masks | _told(discounts, ~ended)
 
     def _begin(self, mask: np.ndarray) -> None:
         """Puts environments at the beginning of an episode."""
