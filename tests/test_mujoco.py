@@ -141,7 +141,9 @@ def test_who_is_healthy_is_as_in_gymnasium_on_both_sides_of_every_bound(name):
     qpos[:, 2 if name == "ant" else 1] = rng.uniform(0.1, 2.5, num)
     qvel = np.float32(rng.uniform(-1, 1, (num, env.model.nv)) * rng.choice([1, 102], (num, 1)))
     physics = task.env.physics
-    healthy = jax.jit(jax.vmap(lambda *x: task.env.is_healthy(physics.reset(*x)[1])))(qpos, qvel)
+    healthy = jax.jit(jax.vmap(lambda *x: task.env.task.is_healthy(physics.reset(*x)[1])))(
+        qpos, qvel
+    )
     expected = []
     for row in zip(qpos, qvel, strict=True):
         env.set_state(*row)
@@ -167,7 +169,9 @@ def test_limits_thresholds_and_spaces_are_gymnasiums(name):
 def test_resets_are_drawn_as_gymnasiums(name):
     task, env, num = envs.make(name), in_gymnasium(name), 300
     keys = jax.random.split(jax.random.key(0), num)
-    draw = jax.jit(jax.vmap(task.env.draw_start))  # what `reset_env` begins from, as tested above
+    draw = jax.jit(
+        jax.vmap(task.env.task.draw_start)
+    )  # what `reset_env` begins from, as tested above
     ours = np.concatenate(draw(keys), axis=1)
     env.reset(seed=0)
     theirs = np.empty_like(ours)

@@ -219,10 +219,9 @@ class GridWorld(gymnasium.Env[int, int]):
     def __init__(self, name: str, goal_reward: float | None = None):
         task = envs.make(name)
         self._world: Any = task.env
-        self._params: Any = task.params
+        params: Any = task.params
+        self._params = params if goal_reward is None else params.replace(goal_reward=goal_reward)
         self._index: int | None = None
-        if goal_reward is not None:
-            self._params = self._params.replace(goal_reward=goal_reward)
         self.observation_space = spaces.Discrete(task.obs_dim)
         self.action_space = spaces.Discrete(task.action_dim)
         arguments = {"name": name, "goal_reward": goal_reward}
