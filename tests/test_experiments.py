@@ -261,14 +261,11 @@ def test_words_that_cannot_work_are_refused(word, field):
 @pytest.mark.parametrize(("name", "options", "field"), [
     ("rn_performance", {"env": "acrobot"}, "env"),
     ("rn_performance", {"env": "cartpole", "variants": "additive_potential+augm"}, "variants"),
-    ("rn_performance", {"rows": ("varied", "transfers")}, "rows"),
     ("rn_performance", {"rows": "tuned"}, "rows"),  # there is none on Cliff Walking
     ("rn_performance", {"bonuses": "icm"}, "bonuses"),
     ("rn_performance", {"rns": 3, "learned": 2}, "rns"),
-    ("rn_performance", {"objective": "steps"}, "objective"),
     ("rn_objectives", {"picks": "top"}, "picks"),
     ("rn_objectives", {"rns": 2, "learned": 3}, "learned"),
-    ("rn_heatmap", {"env": "cartpole"}, "env"),
     ("score_transforms", {"population": 1}, "population"),
     ("timings", {"rows": "pendulum-rn"}, "rows"),
 ])  # fmt: skip

@@ -4,7 +4,6 @@ import functools
 import os
 import subprocess
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -367,13 +366,6 @@ def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", ["", "/proc/nowhere"])
-def test_without_a_cache_folder_threads_share_a_library_of_their_process(folder):
-    done = run_program("threads", "reacher,hopper", "10", SEJAX_CACHE_DIR=folder)
-    assert tempfile.gettempdir() in done.stdout
-
-
-@pytest.mark.slow
 def test_builders_at_the_same_time_leave_one_library_in_place_of_a_broken_one(tmp_path):
     path = tmp_path / library.file_name()
     path.write_text("nothing")
@@ -388,7 +380,6 @@ def test_builders_at_the_same_time_leave_one_library_in_place_of_a_broken_one(tm
 
 PROGRAM = """
 import re, resource, sys
-from concurrent.futures import ThreadPoolExecutor
 import jax, jax.numpy as jnp, numpy as np
 from sejax.envs.mujoco import library
 if sys.argv[1] == "sanitizers":
@@ -396,9 +387,6 @@ if sys.argv[1] == "sanitizers":
     library.FLAGS = (*library.FLAGS, "-g", "-fsanitize=address,undefined",
                      "-fno-sanitize-recover=all", "-U__SANITIZE_ADDRESS__")
 from sejax import envs
-if sys.argv[1] == "threads":
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(envs.make, sys.argv[2].split(",")))
 for name in sys.argv[2].split(","):
     task, num_steps = envs.make(name), int(sys.argv[3])
 
