@@ -20,7 +20,7 @@ from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import find, is_same_space, pretrained_names
+from sejax.proxies.header import find, pretrained_names
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -423,14 +423,6 @@ def test_it_starts_no_backend_of_jax_and_its_ids_are_known_in_new_processes(cont
 
 
 # --- tasks ---------------------------------------------------------------------------------------
-
-
-# Gymnasium's MuJoCo environments need imageio: see test_mujoco.py.
-@pytest.mark.parametrize("name", [k for k, x in sejax.gym.GYMNASIUM_IDS.items() if "-v5" not in x])
-def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
-    task, real = envs.make(name), RealTask.of_gymnasium(sejax.gym.GYMNASIUM_IDS[name])
-    assert real.observation_space.shape == (task.obs_dim,)
-    assert is_same_space(sejax.gym.tasks.space_of(real.action_space, "task"), task.action)
 
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)

@@ -87,7 +87,8 @@ class Task(TaskSpec):
         with _one_error(name):
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if max_steps is None else max_steps
-            options.counts()("env.max_steps", max_steps := options.as_python(limit), 200)
+            max_steps = options.as_python(limit)
+            options.counts()("env.max_steps", max_steps, 200)
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)

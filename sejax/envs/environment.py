@@ -1,7 +1,7 @@
 """A gymnax 1.x `Environment` that does not import gymnax.
 
 Importing anything of gymnax imports all its environments, and with them seaborn and pandas, which
-takes 1.3 CPU s. The methods are gymnax's and the spaces that they return too, so that code which
+takes a CPU second. The methods are gymnax's and the spaces that they return too, so that code which
 takes an environment of gymnax takes one of ours; only `isinstance` tells them apart. gymnax is
 imported when its spaces are asked for.
 """
