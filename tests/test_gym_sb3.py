@@ -86,9 +86,9 @@ def test_the_page_runs_and_its_torch_networks_are_the_se():
     world = sejax.gym.make("cartpole").world
     first = world.first(names["noise"].numpy())
     actions = names["actions"].numpy().astype(np.float32)  # one-hot
-    step = world.step(first, actions, np.ones(len(actions)))
+    _, rewards, *_ = world.step(first, actions, np.ones(len(actions)))
     np.testing.assert_allclose(names["obs"].detach(), first, atol=1e-5)
-    np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
+    np.testing.assert_allclose(names["rewards"].detach()[:, 0], rewards, atol=1e-5)
 
 
 def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,16 +25,6 @@ PREFETCHED = 32  # starts that an environment draws at once, if its generator dr
 
 LIMIT = np.float32(MAX_ABS_VALUE)
 Numbers = np.ndarray | float
-
-
-class Step(NamedTuple):
-    """What a step comes to: of one episode numbers, of several arrays `[batch]`."""
-
-    vector: np.ndarray  # [*batch, obs_dim]
-    reward: Any
-    terminated: Any
-    truncated: Any
-    discount: Any
 
 
 class SyntheticWorld:
@@ -126,7 +116,7 @@ class SyntheticWorld:
 
     def step(
         self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
-    ) -> Step:
+    ) -> tuple[np.ndarray, Any, Any, Any, Any]:
         """One step of each episode.
 
         Args:
@@ -134,6 +124,10 @@ class SyntheticWorld:
           action: from `encode`, `[*batch, action_dim]`.
           time: steps of the episode with this one, `[*batch]`.
           chance: uniform in [0, 1), `[*batch]`, if `draws_ends`.
+
+        Returns:
+          `(vector, reward, terminated, truncated, discount)`: the next state, `[*batch, obs_dim]`;
+          the others `[*batch]`, of one episode numbers.
         """
         outputs = self._predict(action, vector)  # [*batch, obs_dim + 2]
         absurd: Any = False
@@ -152,7 +146,7 @@ class SyntheticWorld:
         if self.config.ends_at_horizon:
             terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
-        return Step(outputs[..., :-2], reward, terminated, truncated, discount)
+        return outputs[..., :-2], reward, terminated, truncated, discount
 
     def observe(self, vector: np.ndarray) -> Any:
         """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
@@ -234,11 +228,11 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         encoded = self.world.encode(action, self.action_space)
         self._time += 1
         chance = self.np_random.random() if self.world.draws_ends else None
-        step = self.world.step(self._vector, encoded, self._time, chance)
-        terminated, truncated = bool(step.terminated), bool(step.truncated)
-        self._vector = None if terminated or truncated else step.vector
-        info = {"discount": float(step.discount)}
-        return self.world.observe(step.vector), float(step.reward), terminated, truncated, info
+        vector, reward, *ends, discount = self.world.step(self._vector, encoded, self._time, chance)
+        terminated, truncated = map(bool, ends)
+        self._vector = None if terminated or truncated else vector
+        info = {"discount": float(discount)}
+        return self.world.observe(vector), float(reward), terminated, truncated, info
 
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
@@ -328,9 +322,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             chances = None
             if self.world.draws_ends:
                 chances = np.array([self._np_random[i].random() for i in np.flatnonzero(on)])
-            step = self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
-            self._vectors[on], rewards[on], discounts[on] = step.vector, step.reward, step.discount
-            terminated[on], truncated[on] = step.terminated, step.truncated
+            self._vectors[on], rewards[on], terminated[on], truncated[on], discounts[on] = (
+                self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
+            )
         self._begin(self._ended)
         self._ended = ended = terminated | truncated
         infos = _told(discounts, on)
