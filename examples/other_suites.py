@@ -6,9 +6,9 @@
     python other_suites.py env.suite=navix env.env_id=Navix-Empty-5x5-v0 env.solved_reward=0.9
 
 [stoa](https://github.com/EdanToledo/Stoa) gives the suites one interface, in which an episode says
-whether it was terminated or truncated and no step resets. Observations of several arrays become one
-vector, in the order of their fields (of a dictionary, its names). Two players, or several actions at
-once, do not fit an agent of sejax.
+whether it was terminated or truncated and no step resets. Observations of several arrays become
+one vector, in the order of their fields (of a dictionary, its names). Two players, or several
+actions at once, do not fit an agent of sejax.
 """
 
 import math
@@ -47,6 +47,14 @@ class SuiteEnv(environment.Environment[SuiteState, environment.EnvParams]):
 
     def __init__(self, env: Any):
         self.env = env
+        space = env.action_space()
+        self.actions: spaces.Space = (
+            spaces.Discrete(int(space.num_values)) if hasattr(space, "num_values")
+            else spaces.Box(space.minimum, space.maximum, space.shape)
+        )  # fmt: skip
+        _, first = jax.eval_shape(env.reset, jax.random.key(0))
+        obs = jax.eval_shape(vector, first.observation)
+        self.observations = spaces.Box(-jnp.inf, jnp.inf, obs.shape)
 
     def reset_env(self, key: Array, params: environment.EnvParams) -> tuple[Array, SuiteState]:
         inner, step = self.env.reset(key)
@@ -66,14 +74,10 @@ class SuiteEnv(environment.Environment[SuiteState, environment.EnvParams]):
         return state.is_cut | (state.time >= params.max_steps_in_episode)
 
     def action_space(self, params: environment.EnvParams) -> spaces.Space:
-        space = self.env.action_space()
-        if hasattr(space, "num_values"):
-            return spaces.Discrete(int(space.num_values))
-        return spaces.Box(space.minimum, space.maximum, space.shape)
+        return self.actions
 
     def observation_space(self, params: environment.EnvParams) -> spaces.Box:
-        obs, _ = jax.eval_shape(lambda: self.reset_env(jax.random.key(0), params))
-        return spaces.Box(-jnp.inf, jnp.inf, obs.shape)
+        return self.observations
 
 
 def vector(observation: Any) -> Array:

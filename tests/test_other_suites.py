@@ -98,6 +98,5 @@ def test_a_reward_network_is_learned_there(make, suite, name, tmp_path):
     assert sejax.load_proxy(tmp_path, task=task).task is task
 
 
-@pytest.mark.parametrize("options", [("navix", "nothing"), ("pgx", "chess")])
-def test_what_does_not_fit_is_refused(make, options):
-    assert refused(make, *options) == "env"
+def test_two_players_are_refused(make):
+    assert refused(make, "pgx", "chess") == "env"
