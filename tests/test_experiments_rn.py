@@ -13,7 +13,6 @@ import sejax
 from experiments import rn_heatmap, rn_performance
 from experiments.common import curves, rn_curves, shards
 from experiments.common import reward_networks as rn
-from experiments.common.reward_networks import STUDIES
 from experiments.common.statistics import mean_interval
 from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_performance import RnPerformance
@@ -190,43 +189,3 @@ def test_settings_are_those_of_the_task():
     assert car.agent("varied") == sejax.config([f"env={car.env}", "proxy=rn"]).agent
     for variant, scale in (("exclusive_non_potential", 0.1), ("exclusive_potential", 1.0)):
         assert rn.learning_config(car, variant, "reward_threshold").proxy.output_scale == scale
-
-
-# --- the paper's tables ---------------------------------------------------------------------------
-
-# The tables of default hyperparameters, for agents that are trained on learned RNs, and the
-# "optimized value" of the tables of the ICM and of the count-based agents. SARSA and TD3 are not
-# here: see `STUDIES`.
-DDQN = (
-    "warmup_episodes=1 batch_size=32 learning_rate=0.00025 tau=0.01 discount=0.99 epsilon_init=1 "
-    "epsilon_min=0.1 epsilon_decay=0.9 num_layers=1 hidden_size=64 activation=relu "
-    "buffer_size=1000000"
-)
-PPO = "discount=0.99 value_weight=1 clip_ratio=0.2 num_layers=2"
-ICM = "feature_dim=32 hidden_size=128"
-PAPER = {
-    "cliff_walking.agent": "learning_rate=1 discount=0.8 epsilon_init=0.1 epsilon_min=0.1 "
-    "epsilon_decay=0",
-    "cartpole.agent": DDQN,
-    "cartpole.transfer_agent": f"{DDQN} feature_dim=128 stream_num_layers=1 stream_hidden_size=128",
-    "mountain_car_continuous.transfer_agent": f"{PPO} epochs=80 learning_rate=0.0003 "
-    "update_episodes=10 action_repeat=5 entropy_weight=0.01 hidden_size=64 activation=relu",
-    "halfcheetah.transfer_agent": f"{PPO} epochs=10 learning_rate=0.00001 update_episodes=1 "
-    "action_repeat=1 entropy_weight=0.001 hidden_size=128 activation=tanh",
-    "cliff_walking.bonuses": "reward_scale=0.1",
-    "cartpole.bonuses": f"{ICM} learning_rate=0.00001 forward_weight=0.05 reward_scale=0.03",
-    "mountain_car_continuous.bonuses": f"{ICM} learning_rate=0.0005 forward_weight=0.1 "
-    "reward_scale=0.01",
-    "halfcheetah.bonuses": f"{ICM} learning_rate=0.00001 forward_weight=0.001 reward_scale=0.1",
-}
-
-
-@pytest.mark.parametrize("which", PAPER)
-def test_agents_and_bonuses_are_those_of_the_papers_tables(which):
-    env, _, part = which.partition(".")
-    config, expected = getattr(STUDIES[env], part), PAPER[which].split()
-    if part == "bonuses":
-        (config,) = config.values()
-    for name, _, value in (word.partition("=") for word in expected):
-        found = getattr(config, name)
-        assert found == (value if isinstance(found, str) else float(value)), name

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sejax import options
@@ -162,28 +163,23 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         action = env.action_space(params).sample(key)
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
         env.is_truncated(next_state, params)
-        begin, after = {"obs": obs, "state": state}, {"obs": next_obs, "state": next_state}
-        return begin, after, reward, terminated
+        in_space = jnp.zeros(env.observation_space(params).shape, obs.dtype)
+        wanted = {"obs": in_space, "next_obs": obs, "state": state}
+        wanted |= {"reward": jnp.float32(0), "terminated": jnp.bool_(False)}
+        got = {"obs": obs, "next_obs": next_obs, "state": next_state}
+        return wanted, got | {"reward": jnp.float32(reward), "terminated": terminated}
 
     def kinds(tree: PyTree) -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
-    begin, after, reward, terminated = jax.eval_shape(step, jax.random.key(0))
-    shape = tuple(env.observation_space(params).shape)
-    began, went_on = kinds(begin), kinds(after)
+    wanted, got = map(kinds, jax.eval_shape(step, jax.random.key(0)))
     faults = [
-        f"{key} is {began.get(key)} after reset_env and {went_on.get(key)} after step_env"
-        for key in began | went_on
-        if began.get(key) != went_on.get(key)
+        f"{key} is {got.get(key)}, not {wanted.get(key)}"
+        for key in wanted | got
+        if wanted.get(key) != got.get(key)
     ]
-    if begin["obs"].shape != shape:
-        faults.append(f"obs is {began['obs']} in a space of shape {list(shape)}")
-    if reward.shape != ():
-        faults.append(f"reward has shape {list(reward.shape)}, not []")
-    if terminated.shape != () or terminated.dtype != bool:
-        faults.append(f"terminated is {kinds(terminated)['']}, not bool[]")
     options.require(
         not faults,
         "env",
