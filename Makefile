@@ -28,7 +28,7 @@ test-suites test-examples test-trackers test-ray test-lowest test-latest:
 
 # Environments of other JAX suites, through stoa.
 test-suites: PACKAGES := --constraint constraints.txt --editable '.[stoa]' brax craftax jumanji navix pgx playground xminigrid
-test-suites: TESTS := stoa
+test-suites: TESTS := other_suites
 
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.

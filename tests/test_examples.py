@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import paper_training, printed, random_like, raveled, refused, shapes_of
+from support import paper_training, printed, refused
 
 import sejax
-from sejax.agents import sac
 from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SLOW = ("own_objective", "read_a_set", "suite_reward_network")
+SLOW = ("own_objective", "own_task", "own_proxy", "read_a_set", "other_suites")
 TINY = {
     "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],
@@ -26,8 +25,8 @@ TINY = {
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
     "read_a_set": ["--agents=3", "--size=2", "--generations=2"],
-    "suite_reward_network": ["gymnax/Catch-bsuite", "--solved=0.8", "--generations=1",
-                             "--population=2", "--agents=2", "--steps=30"],
+    "other_suites": ["env=gymnax/Catch-bsuite", "env.solved_reward=0.8", "generations=1",
+                     "es.population_size=2", "training.max_steps=30"],
     "train_thousands": ["--agents=6", "--num_parallel=2"],
     "sb3_agents": ["--steps=10", "--seeds=1", "--episodes=1"],
     "sbx_agent": ["--steps=10", "--seeds=1", "--episodes=1"],
@@ -44,7 +43,7 @@ PRINTS = {
     "own_objective": r"MaxReward: mean return .*\nRiskAverse: mean return",
     "own_proxy": r"linear_cartpole\.safetensors: best \d+, 35 weights",
     "read_a_set": r"seed 0, .*3 fresh agents return .*\nseed 1,",
-    "suite_reward_network": r"with the RN: \d of 2 agents .*\nwithout it: \d of 2 agents",
+    "other_suites": r"with the RN: \d of 8 agents .*\nwithout it: \d of 8 agents",
     "train_thousands": r"proxy: 6 agents .*\n.*test return -12\.0\nreal task: 6 agents",
     "sb3_agents": r"(?s)cartpole  PPO +\d+\.0 ± 0.*DQN.*acrobot   PPO.*DQN +-\d+\.0 ± 0.0 +-\d",
     "sbx_agent": r"after 10 steps on the SE: \d+\n.*on CartPole: \d+\n",
@@ -79,7 +78,7 @@ def test_every_example_is_tested():
 def _marked(name):
     """An example with its marks: warnings of another package are its own."""
     own = [pytest.mark.filterwarnings("default")] if name in NEEDS else []
-    # The dearest; the objective of one is used by a command below.
+    # The dearest; a command below uses the task, the proxy and the objective of three.
     return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (name in SLOW)])
 
 
@@ -131,64 +130,7 @@ def test_algorithm_1_learns_an_se_whose_agents_solve_cartpole(tmp_path):
     assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 170
 
 
-# --- own_agent -----------------------------------------------------------------------------------
-
-OBS_DIM, ACTION_DIM, BATCH = 3, 2, 5
-
-
-def flat(actor, critics, log_alpha):
-    """Parameters as sejax has them: one vector, kernels `[out, in]`."""
-
-    def turned(path, x):
-        return np.swapaxes(x, -2, -1) if path[-1].key == "kernel" else x
-
-    trees = jax.tree_util.tree_map_with_path(turned, (actor, critics))
-    return np.append(raveled(trees), log_alpha)
-
-
-def test_a_sac_update_is_sejaxs(examples):
-    """Of the agent of the package, which equals torch's (test_sac.py)."""
-    own_agent = examples("own_agent")
-    options = {"batch_size": BATCH, "hidden_size": 4, "tau": 0.1, "discount": 0.9}
-    networks = own_agent.Networks(own_agent.Actor(ACTION_DIM, 4), own_agent.Critic(4))
-    shapes = shapes_of(networks.init, jax.random.key(0), np.zeros(OBS_DIM), np.zeros(ACTION_DIM))
-    params = random_like(shapes, seed=1)
-    target_critics = jax.tree.map(lambda x: x + np.float32(0.1), params["critics"])
-    state = own_agent.SACState(
-        params=params, target_critics=target_critics, opt_state=own_agent.ADAM.init(params),
-        is_warming_up=np.bool_(False),
-        hparams=sejax.agents.traced(own_agent.SAC(**options), own_agent.SACHparams),
-    )  # fmt: skip
-    rng = np.random.default_rng(0)
-    arrays = {
-        "obs": rng.normal(size=(BATCH, OBS_DIM)),
-        "action": rng.uniform(-1, 1, (BATCH, ACTION_DIM)),
-        "reward": rng.normal(size=BATCH),
-        "discount": rng.uniform(-0.2, 1.2, BATCH),
-        "next_obs": rng.normal(size=(BATCH, OBS_DIM)),
-        "weight": np.array([1, 1, 1, 1, 0]),
-    }
-    batch = sejax.agents.Transition(**{name: np.float32(x) for name, x in arrays.items()})
-    noise = np.float32(rng.normal(size=(2, BATCH, ACTION_DIM)))
-    after = jax.jit(lambda *args: own_agent.learn(networks, *args))(state, batch, noise)
-
-    config = sejax.SACConfig(**options, num_layers=2, activation="relu", learning_rate=1e-3,
-                             alpha=None, target_entropy=-1.0)  # fmt: skip
-    policy = sac.gaussian_policy(ACTION_DIM, 1.0)
-    agent = sac.make_sac(config, OBS_DIM, policy)
-    learn = sac.make_learning_step(sac.make_networks(config, OBS_DIM, policy), policy)
-    expected = shapes_of(agent.init, jax.random.key(0), agent.hparams).replace(
-        params=flat(**params), hparams=agent.hparams,
-        target_critics=flat(None, target_critics, [])
-    )  # fmt: skip
-    columns = sac.LearningNoise(action=noise[0].T, next_action=noise[1].T)
-    expected = jax.jit(learn)(expected, jax.tree.map(np.transpose, batch), columns)
-    moments = flat(**after.opt_state.mu)  # after the first step a tenth of the gradient
-    moments[-1] /= np.exp(params["log_alpha"])  # the temperature's loss: alpha, there its logarithm
-    np.testing.assert_allclose(moments, expected.opt_state.mu, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(flat(**after.params), expected.params, rtol=1e-5, atol=1e-6)
-    critics = flat(None, after.target_critics, [])
-    np.testing.assert_allclose(critics, expected.target_critics, rtol=1e-5, atol=1e-6)
+# --- own_task, own_objective, own_agent ----------------------------------------------------------
 
 
 def test_the_reacher_is_solved_by_moving_towards_the_target(examples):

@@ -26,16 +26,6 @@ def test_a_proxy_has_paid_when_what_its_students_save_is_what_it_cost():
     assert value == 1e6 / 987.5 and np.isnan(ends).all(), "four agents have no interval"
 
 
-@pytest.mark.parametrize("ends, text", [
-    ((1000, 900.4, 1200), "1,000 [900, 1,200]"), ((1000, 900, np.inf), "1,000 [900, never]"),
-    ((np.inf, 900, np.inf), "never [900, never]"), ((np.inf, np.inf, np.inf), "never"),
-    ((1000, np.nan, np.nan), "1,000"), ((np.inf, np.nan, np.nan), "never"),
-    ((np.nan, np.nan, np.nan), ""),
-])  # fmt: skip
-def test_a_number_of_agents_says_never_where_nothing_is_saved(ends, text):
-    assert break_even.agents_text(*ends) == text
-
-
 def agents(role, steps, returns, proxy="cartpole"):
     columns = {"proxy": proxy, "role": role, "kind": "ppo" if role == "tuned" else "ddqn",
                "target": 195.0, "most_steps": 2000, "train_steps": steps, "test_return": returns,

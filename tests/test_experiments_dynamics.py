@@ -139,18 +139,6 @@ def test_kinds_are_summarised_over_their_runs():
     assert {name: tuple(found.loc[name]) for name in expected} == expected
 
 
-def test_kinds_differ_in_their_proxy():
-    settings = se_dynamics.SeDynamics.of(env="acrobot")
-    configs = {kind: settings.config_of(kind) for kind in settings.kinds}
-    bandit, soft = configs["bandit"], configs["soft"]
-    assert bandit == settings.learn_config([]) and bandit.proxy.is_bandit
-    assert (soft.proxy.done, soft.proxy.horizon, soft.proxy.initial_state) == ("soft", None, "real")
-    assert (configs["shortest"].proxy.min_steps, soft.proxy.min_steps) == (50, 1)
-    for kind, config in configs.items():
-        assert config.es == bandit.es and settings.agent_of("ddqn") == config.agent
-        assert kind == "bandit" or config.training.max_steps == settings.max_steps
-
-
 @pytest.mark.parametrize(("page", "given", "field"), [
     (se_dynamics, {"kinds": ["hard"]}, "kinds"), (se_dynamics, {"students": ["dqnn"]}, "students"),
     (se_dynamics, {"students": ["ddqn", "td3"]}, "agent"),

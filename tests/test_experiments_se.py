@@ -6,14 +6,13 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-import scipy.stats
 import yaml
 from support import assert_equal, paper_training, refused
 from test_experiments import TINY, TINY_AGENT, fields, save_ses, tiny
 
 import sejax
 from experiments import se_feasibility, se_performance
-from experiments.common import figures, runs, shards
+from experiments.common import runs, shards
 from experiments.common.statistics import mean_interval
 from sejax import envs
 from sejax.options import ConfigError
@@ -123,18 +122,6 @@ def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
     assert settings.to_dict() == {"varied": 24, "best": 9}
     alone = agents[agents["group"] == "se0"]
     assert "best" not in set(se_performance.with_best(alone)["setting"])
-
-
-def test_the_density_is_that_of_reflected_kernels():
-    values, low, high = np.array([8.0, 50, 50, 200]), 8.0, 200.0
-    grid = np.linspace(low, high, 4001)
-    assert np.trapezoid(figures.density(values, grid, low, high), grid) == pytest.approx(1, 1e-3)
-    width = values.std() * 4 ** (-1 / 5)
-    centres = np.concatenate([values, 2 * low - values, 2 * high - values])
-    expected = scipy.stats.norm.pdf(30, centres, width).sum() / 4
-    assert figures.density(values, [30.0], low, high)[0] == pytest.approx(expected)
-    equal = figures.density(np.full(5, 200.0), grid, low, high)
-    assert np.trapezoid(equal, grid) == pytest.approx(1, abs=1e-3) and np.argmax(equal) == 4000
 
 
 @pytest.mark.slow

@@ -109,25 +109,3 @@ def test_the_last_steps_of_a_training_are_recorded(tmp_path, capacity):
     for episode in np.unique(rows[:, 0])[1:]:
         rewards = rows[rows[:, 0] == episode, 1]
         np.testing.assert_allclose(rewards.sum(), result.returns[int(episode)], rtol=1e-4)
-
-
-def test_the_table_says_which_distribution_the_response_is_closer_to():
-    states = {"train": [0.0, 0.2], "test": [3.0, 4.0], "response": [0.1, 0.5]}
-    rows = pd.DataFrame([
-        {"kind": "ddqn", "source": source, "agent": 0, "episode": i % 2, "reward": 1.0 + i,
-         "state_0": x}
-        for source, values in states.items() for i, x in enumerate(values)
-    ])  # fmt: skip
-    bins = se_histograms.binned(rows)
-    width = 4.0 / se_histograms.NUM_BINS
-    assert bins[bins["dimension"] == "state_0"]["bin"].tolist() == [0, 50, 100, 250, 1500, 1999]
-    summary = se_histograms.summarise(bins)
-    state = summary.iloc[0]
-    assert state["response_to_train"] == pytest.approx(0.2, abs=width)
-    assert state["response_to_test"] == pytest.approx(3.2, abs=width)
-    assert state["std_train"] == pytest.approx(0.1, abs=width)
-    returns = se_histograms.test_returns(rows)
-    table = se_histograms.make_table(SimpleNamespace(name="other"), summary, returns)
-    assert table["response is closer to"][0] == "train"
-    assert list(table["next"]) == ["state 0", "reward"]
-    assert table["return"][0] == "1.50 ± 0.71", "of the two test episodes"

@@ -82,26 +82,6 @@ def test_steps_are_those_of_gymnax_as_vectors(gymnax_id):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("proxy", ["se", "rn"])
-@pytest.mark.parametrize("gymnax_id", IDS)
-def test_every_environment_learns_a_proxy(gymnax_id, proxy):
-    """Three generations, and scores that are numbers."""
-    task = task_of(gymnax_id)
-    agents = {"discrete": "ddqn", "continuous": "td3"}
-    agent = agents[task.actions] if task.num_states is None else "q_learning"
-    small = ["agent.hidden_size=8", "agent.batch_size=8", "agent.warmup_episodes=0"]
-    config = sejax.config([
-        f"env={PREFIX}{gymnax_id}", "env.solved_reward=0", f"proxy={proxy}", f"agent={agent}",
-        *(small if task.num_states is None else []), "generations=3", "es.population_size=2",
-        "proxy.hidden_size=8", "training.max_steps=50", "training.max_episodes=50",
-        "training.test_episodes=1", "devices=1",
-    ])  # fmt: skip
-    learned = jax.jit(sejax.make_learner(**config.parts(), generations=3))(KEY)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(learned.weights))
-    assert np.isfinite(learned.info.incumbent_mean).all()
-
-
 def test_limit_and_threshold_are_those_asked_for_or_known():
     assert task_of("CartPole-v1").max_steps == 500
     task = task_of("CartPole-v1", max_steps=7, solved_reward=100)

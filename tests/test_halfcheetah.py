@@ -93,18 +93,13 @@ WEIGHTED = "proxy.variant=exclusive_weighted_info"
     ("overrides", "field"),
     [
         ([ENV, RN, "env.backend=sprung"], "env.backend"),
-        (["env=cartpole", "env.backend=mjx"], "env.backend"),
         ([ENV, "preset=paper"], "preset"),
-        (["env=cartpole", RN, "proxy.augmented=true"], "proxy.augmented"),
         (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented"),  # has no v
         (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "proxy.variant"),
         ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
         ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
-        ([ENV, RN, WEIGHTED, "proxy.output_scale=0.1"], "proxy.output_scale"),
         ([ENV, RN, "agent=ddqn"], "agent"),
         (["env=pendulum", RN, "preset=paper"], "preset"),
-        ([RN, "proxy.variant=additive"], "proxy.variant"),
-        ([RN, "proxy.done=soft"], "proxy.done"),
         (["env=hopper", "env.reset_noise_scale=-1"], "env.reset_noise_scale"),
         (["env=ant", "env.ctrl_cost_weight=1e31"], "env.ctrl_cost_weight"),
     ],

@@ -12,7 +12,7 @@ import re
 import string
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +47,15 @@ FUNCTIONS |= {each.__name__: each for each in (mean_interval, difference_interva
 
 @dataclass(frozen=True)
 class Claims:
-    """The entries of `docs/claims.yaml`, and the documents of the project in a folder."""
+    """The entries of `docs/claims.yaml`, and the documents of the project in a folder.
+
+    Attributes:
+      frames: stored rows that were read, by what entries call them.
+    """
 
     root: Path
     entries: Mapping[str, Any]
+    frames: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, root: Path) -> "Claims":
@@ -64,6 +69,12 @@ class Claims:
         return remake.remake(self.root)
 
     def frame(self, rows: str) -> Any:
+        """Stored rows, which are read once."""
+        if rows not in self.frames:
+            self.frames[rows] = self.read_frame(rows)
+        return self.frames[rows]
+
+    def read_frame(self, rows: str) -> Any:
         """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, settings."""
         if rows.startswith("settings "):
             return sejax.config(rows.split()[1:])
@@ -141,10 +152,10 @@ class Claims:
         Every second group of the pattern is a number; the others are the text between.
         """
         parts, said = [], []
-        for literal, field, spec, _ in string.Formatter().parse(entry["text"]):
+        for literal, name, spec, _ in string.Formatter().parse(entry["text"]):
             parts.append(f"({loosely(literal)})")
-            if field is not None:
-                said.append(f"{{{field}:{spec}}}".format_map(names))
+            if name is not None:
+                said.append(f"{{{name}:{spec}}}".format_map(names))
                 is_number = re.fullmatch(NUMBER, said[-1])
                 parts.append(f"({NUMBER})" if is_number else f"({re.escape(said[-1])})")
         return re.compile("".join(parts)), said

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sejax import options
@@ -85,7 +86,12 @@ class Task(TaskSpec):
             "if it is undefined.",
         )
         with _one_error(name):
-            params, max_steps = _with_limit(env, params, max_steps)
+            params = env.default_params if params is None else params
+            limit = params.max_steps_in_episode if max_steps is None else max_steps
+            max_steps = options.as_python(limit)
+            options.counts()("env.max_steps", max_steps, 200)
+            if params.max_steps_in_episode != max_steps:
+                params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)
             vectors, observation, action = as_vectors(env, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
@@ -93,7 +99,7 @@ class Task(TaskSpec):
         super().__init__(
             observation=observation,
             action=action,
-            max_steps=max_steps,
+            max_steps=int(max_steps),
             solved_reward=solved_reward,
             info_keys=info_keys,
             augmented_keys=augmented_keys,
@@ -104,14 +110,8 @@ class Task(TaskSpec):
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
         """The task of an environment that has the spec's spaces."""
-        return cls(
-            name=name,
-            env=env,
-            max_steps=spec.max_steps,
-            solved_reward=spec.solved_reward,
-            info_keys=spec.info_keys,
-            augmented_keys=spec.augmented_keys,
-        )
+        names = ("max_steps", "solved_reward", "info_keys", "augmented_keys")
+        return cls(name=name, env=env, **{field: getattr(spec, field) for field in names})
 
 
 def require_own_steps(env: Environment) -> None:
@@ -130,19 +130,6 @@ def require_own_steps(env: Environment) -> None:
         "must change reset_env and step_env in place of reset and step; got "
         f"{type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper.",
     )
-
-
-def _with_limit(
-    env: Environment, params: EnvParams | None, max_steps: int | None
-) -> tuple[EnvParams, int]:
-    """Params that have the step limit, and the limit."""
-    default = env.default_params
-    params = default if params is None else params
-    limit = options.as_python(params.max_steps_in_episode if max_steps is None else max_steps)
-    options.counts()("env.max_steps", limit, 200)
-    if params.max_steps_in_episode != limit:
-        params = dataclasses.replace(params, max_steps_in_episode=limit)
-    return params, int(limit)
 
 
 @contextlib.contextmanager
@@ -176,28 +163,23 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         action = env.action_space(params).sample(key)
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
         env.is_truncated(next_state, params)
-        begin, after = {"obs": obs, "state": state}, {"obs": next_obs, "state": next_state}
-        return begin, after, reward, terminated
+        in_space = jnp.zeros(env.observation_space(params).shape, obs.dtype)
+        wanted = {"obs": in_space, "next_obs": obs, "state": state}
+        wanted |= {"reward": jnp.float32(0), "terminated": jnp.bool_(False)}
+        got = {"obs": obs, "next_obs": next_obs, "state": next_state}
+        return wanted, got | {"reward": jnp.float32(reward), "terminated": terminated}
 
     def kinds(tree: PyTree) -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
-    begin, after, reward, terminated = jax.eval_shape(step, jax.random.key(0))
-    shape = tuple(env.observation_space(params).shape)
-    began, went_on = kinds(begin), kinds(after)
+    wanted, got = map(kinds, jax.eval_shape(step, jax.random.key(0)))
     faults = [
-        f"{key} is {began.get(key)} after reset_env and {went_on.get(key)} after step_env"
-        for key in began | went_on
-        if began.get(key) != went_on.get(key)
+        f"{key} is {got.get(key)}, not {wanted.get(key)}"
+        for key in wanted | got
+        if wanted.get(key) != got.get(key)
     ]
-    if begin["obs"].shape != shape:
-        faults.append(f"obs is {began['obs']} in a space of shape {list(shape)}")
-    if reward.shape != ():
-        faults.append(f"reward has shape {list(reward.shape)}, not []")
-    if terminated.shape != () or terminated.dtype != bool:
-        faults.append(f"terminated is {kinds(terminated)['']}, not bool[]")
     options.require(
         not faults,
         "env",

@@ -1,13 +1,14 @@
 """A gymnax 1.x `Environment` that does not import gymnax.
 
 Importing anything of gymnax imports all its environments, and with them seaborn and pandas, which
-takes 1.3 CPU s. The methods are gymnax's and the spaces that they return too, so that code which
+takes a CPU second. The methods are gymnax's and the spaces that they return too, so that code which
 takes an environment of gymnax takes one of ours; only `isinstance` tells them apart. gymnax is
 imported when its spaces are asked for.
 """
 
+import dataclasses
 import functools
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -45,18 +46,19 @@ class Environment(Generic[State, Params]):
 
     Args:
       spec: its spaces, and the step limit of `default_params`.
+      params: `default_params` but for that limit.
 
     Attributes:
       spaces: of observations and actions; None in a wrapper, whose methods `observation_space` and
         `action_space` say.
     """
 
-    params_class: ClassVar[type[EnvParams]] = EnvParams
     spaces: tuple[Space, Space] | None = None
 
-    def __init__(self, spec: TaskSpec):
+    def __init__(self, spec: TaskSpec, params: EnvParams | None = None):
         self.spaces = spec.observation, spec.action
-        self._default_params = self.params_class(max_steps_in_episode=spec.max_steps)
+        params = params or EnvParams()
+        self._default_params = dataclasses.replace(params, max_steps_in_episode=spec.max_steps)
 
     @property
     def default_params(self) -> Params:
@@ -93,14 +95,11 @@ class Environment(Generic[State, Params]):
         """As `observe`, under gymnax's name."""
         return self.observe(state)
 
-    def discount(self, state: State, params: Params) -> Array:
-        """0 in a terminal state, else 1."""
-        return jax.lax.select(self.is_terminated(state, params), 0.0, 1.0)
-
     def after(self, state: State, reward: Array, params: Params) -> Step[State]:
         """What a step returns that leads to this state."""
-        info = {"discount": self.discount(state, params)}
-        return self.observe(state), state, reward, self.is_terminated(state, params), info
+        terminated = self.is_terminated(state, params)
+        info = {"discount": jax.lax.select(terminated, 0.0, 1.0)}
+        return self.observe(state), state, reward, terminated, info
 
     @functools.partial(jax.jit, static_argnames=("self",))
     def reset(self, key: Array, params: Params | None = None) -> tuple[Array, State]:
@@ -142,8 +141,7 @@ class Environment(Generic[State, Params]):
     @property
     def num_actions(self) -> int:
         """Number of discrete actions, or length of a continuous one."""
-        assert self.spaces is not None
-        return self.spaces[1].size
+        return spaces_of(self)[1].size
 
     @property
     def name(self) -> str:

@@ -73,8 +73,10 @@ class GridWorld(Environment[GridState, GridParams]):
         Raises:
           ValueError: if the map is no rectangle of these characters with one S.
         """
-        _check(rows)
-        cells = np.array([list(row) for row in rows])
+        cells = np.array([list(row.ljust(max(map(len, rows)), "?")) for row in rows])
+        wrong = {*cells.flat} - {*CELLS}
+        if wrong or np.sum(cells == "S") != 1:
+            raise ValueError(f"rows must have one length, one S and else {list(CELLS)}; got {rows}")
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._default_params = params or GridParams()
         self._start = int(np.flatnonzero(cells == "S")[0])
@@ -104,17 +106,6 @@ class GridWorld(Environment[GridState, GridParams]):
 
     def is_terminated(self, state: GridState, params: GridParams) -> Bool[Array, ""]:
         return jnp.asarray(self._goal | self._hole)[state.index]
-
-
-def _check(rows: Sequence[str]) -> None:
-    characters = "".join(rows)
-    for holds, must, got in (
-        (len({len(row) for row in rows}) == 1, "have one length", [len(row) for row in rows]),
-        ({*characters} <= {*CELLS}, f"consist of {list(CELLS)}", sorted({*characters} - {*CELLS})),
-        (characters.count("S") == 1, "have one S", characters.count("S")),
-    ):
-        if not holds:
-            raise ValueError(f"rows must {must}; got {got}")
 
 
 def _next_indices(cells: np.ndarray) -> np.ndarray:

@@ -41,6 +41,12 @@ class GymnaxTask(Options):
     max_steps: int | None = option(None, counts("an episode has steps"))
 
     def make(self) -> Task:
+        options.require(
+            self.name.startswith(PREFIX),
+            "env",
+            f"must be one of gymnax; got {options.shortened(self.name)}. Other suites are in an "
+            "example now. Set env=other_suites:task in the folder examples/.",
+        )
         import gymnax
         from gymnax.registration import registered_envs
 

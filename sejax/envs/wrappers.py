@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from sejax.envs.environment import (
     Environment,
@@ -35,14 +36,6 @@ class Wrapper(Environment[State, Params]):
     @property
     def default_params(self) -> Params:
         return self.env.default_params
-
-    @property
-    def name(self) -> str:
-        return self.env.name
-
-    @property
-    def num_actions(self) -> int:
-        return self.env.num_actions
 
     def reset_env(self, key: Array, params: Params) -> tuple[Array, State]:
         return self.env.reset_env(key, params)
@@ -88,21 +81,15 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
     ) -> Step[EnvState]:
         total, num_steps = jnp.float32(0), jnp.int32(0)
         ended = jnp.bool_(False)
-        out: Step[EnvState] | None = None
+        out: Any = None
         for step_key in jax.random.split(key, self.num_repeats):
             new = self.env.step_env(step_key, state, action, params)
-            out = new if out is None else _select(ended, out, new)
-            _, state, reward, terminated, info = out
+            out = new if out is None else jax.tree.map(partial(jnp.where, ended), out, new)
+            obs, state, reward, terminated, info = out
             total = total + jnp.where(ended, 0.0, reward)
             num_steps = num_steps + ~ended
             ended = terminated | self.env.is_truncated(state, params) | info.get("nonfinite", False)
-        assert out is not None
-        obs, state, _, terminated, info = out
         return obs, state, total, terminated, {**info, "num_steps": num_steps}
-
-
-def _select(condition: Array, a: PyTree, b: PyTree) -> PyTree:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 @functools.cache
@@ -181,13 +168,12 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
         self, env: Environment, spaces: tuple[Space, Space], action_shape: tuple[int, ...]
     ):
         super().__init__(env)
-        observation, action = spaces
-        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+        self.spaces = observation, action = spaces
+        self._bounds = None
         if isinstance(action, Box):
-            low, high = (np.array(x, np.float32) for x in (action.low, action.high))
-            self._bounds = low.reshape(action_shape), high.reshape(action_shape)
-            action = Box.symmetric(*[1.0] * action.size)
-        self.spaces = observation, action
+            bounds = np.array([action.low, action.high], np.float32)
+            self._bounds = bounds.reshape(2, *action_shape)
+            self.spaces = observation, Box.symmetric(*[1.0] * action.size)
 
     def reset_env(self, key: Array, params: EnvParams) -> tuple[Array, EnvState]:
         obs, state = self.env.reset_env(key, params)
@@ -236,12 +222,8 @@ def as_vectors(env: Environment, params: EnvParams) -> tuple[Environment, Space,
             f"must have bounded actions; got {shortened(action)}. Give its action space a finite "
             "low and high.",
         )
-    if has_plain_obs and (isinstance(action, Discrete) or _is_symmetric(action, shape)):
+        is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # from the same -x to x
+    if has_plain_obs and (isinstance(action, Discrete) or is_vector):
         return env, observation, action
     vectors = AsVectors(env, (observation, action), shape)
     return vectors, *spaces_of(vectors)
-
-
-def _is_symmetric(box: Box, shape: tuple[int, ...]) -> bool:
-    """Whether a box is a vector between the same -x and x in each dimension."""
-    return len(shape) == 1 and {-x for x in box.low} == set(box.high) and len({*box.high}) == 1

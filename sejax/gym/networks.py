@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
 
@@ -53,16 +54,8 @@ def joined(networks: Sequence[Layers]) -> Layers:
     whole: Layers = []
     for parts in zip(*networks, strict=True):
         kernels, biases = zip(*parts, strict=True)
-        kernel = _block_diagonal(kernels) if whole else np.concatenate(kernels, axis=1)
-        whole.append((kernel, np.concatenate(biases)))
-    return whole
-
-
-def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    ends = np.cumsum([block.shape for block in blocks], axis=0)
-    whole = np.zeros(ends[-1], np.float32, order="F")
-    for block, (row, column) in zip(blocks, ends, strict=True):
-        whole[row - block.shape[0] : row, column - block.shape[1] : column] = block
+        kernel = block_diag(*kernels) if whole else np.concatenate(kernels, axis=1)
+        whole.append((np.asfortranarray(kernel), np.concatenate(biases)))
     return whole
 
 

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
-from sejax.gym.tasks import Env, RealTask, rn_env, se_task
+from sejax.gym.tasks import Env, RealTask, make_gymnasium, real_env, se_task
 from sejax.options import ConfigError, as_python, counts, registry, require, shortened
 from sejax.proxies.header import Header, pretrained_names, read
 
@@ -47,13 +47,19 @@ def make(
     """
     header, world = _read(source, task, render_mode)
     name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
-    env: SyntheticEnv | RewardNetwork
+    kwargs = {"source": str(source), "task": task, "render_mode": render_mode}
     if world:
         env = SyntheticEnv(world)
-    else:
-        env, name = RewardNetwork(rn_env(header, task, render_mode), source), f"{name}-rn"
-    env.spec = _spec(name, source=str(source), task=task, render_mode=render_mode)
-    return env
+        env.spec = _spec(name, **kwargs)
+        return env
+    fix = "sejax.gym.RewardNetwork(env, source)"
+    must = f"must be an id of Gymnasium; got {shortened(task)}. Set {fix}."
+    require(isinstance(task, str | None), "task", must)
+    options = {"render_mode": render_mode}
+    real = make_gymnasium(str(task), **options) if task else real_env(header, fix, **options)
+    rewards = RewardNetwork(real, source)
+    rewards._cached_spec = _spec(f"{name}-rn", **kwargs)  # it makes all of it
+    return rewards
 
 
 def make_vec(
@@ -132,16 +138,15 @@ def register() -> list[str]:
       >>> register()[0], gymnasium.make("sejax.gym:sejax/acrobot").action_space
       ('sejax.gym:sejax/acrobot', Discrete(3))
     """
-    specs = [_spec(name, source=name) for name in pretrained_names()]
-    for spec in specs:
-        gymnasium.registry.setdefault(spec.id, spec)
-    return [f"sejax.gym:{spec.id}" for spec in specs]
+    for name in pretrained_names():
+        gymnasium.registry.setdefault(f"sejax/{name}", _spec(name, source=name))
+    return [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
 
 
 def _spec(name: str, **kwargs: Any) -> EnvSpec:
     """How Gymnasium makes it; with `max_episode_steps` it would add a second time limit."""
-    entries: dict[str, Any] = {"vector_entry_point": "sejax.gym:make_vec", "kwargs": kwargs}
-    return EnvSpec(f"sejax/{name}", "sejax.gym:make", **entries)
+    many = "sejax.gym:make_vec"
+    return EnvSpec(f"sejax/{name}", "sejax.gym:make", vector_entry_point=many, kwargs=kwargs)
 
 
 def _count(num_envs: float) -> int:
@@ -161,8 +166,7 @@ def _read(
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
-    can_do = render_mode in (None, "rgb_array")
-    got = shortened(render_mode)
-    require(can_do, "render_mode", f"must be None, as an SE has no picture; got {got}.")
+    must = f"must be None, as an SE has no picture; got {shortened(render_mode)}."
+    require(render_mode in (None, "rgb_array"), "render_mode", must)
     config = registry.configure("proxy", header.config["proxy"])
     return header, SyntheticWorld(weights, config, se_task(header, config, task))

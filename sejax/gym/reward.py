@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import ObservationWrapper
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.spaces import Box, Discrete, Space, flatdim
 from gymnasium.utils import RecordConstructorArgs
@@ -94,13 +93,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if isinstance(env.observation_space, Discrete) and self._layers:
             self._table = self._apply(np.eye(num_inputs)).tolist()
         self._potential = 0.0  # of the state that the agent is in
-        self._made_as: EnvSpec | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode of the environment."""
         obs, info = self.env.reset(seed=seed, options=options)
-        nothing = np.zeros(len(self._info_keys), np.float32)  # v before the first step, as in JAX
-        self._potential = self.potential(obs, nothing)
+        # v is 0 before the first step, as in JAX.
+        self._potential = self.potential(obs, np.zeros(len(self._info_keys), np.float32))
         return obs, info
 
     def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
@@ -133,15 +131,6 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         outputs = networks.forward(self._layers, self.config.activation, x)
         return self.config.output_scale * outputs[..., 0]
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """That of `sejax.gym.make`, which makes all of it; else the environment's, with this."""
-        return self._made_as or super().spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._made_as = value
-
     def _bonus(self, obs: Any, told: np.ndarray, ends: bool) -> float:
         """What a transition is worth beside the real reward."""
         if self._weights is not None:
@@ -166,10 +155,11 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         name = "info_keys" if weighs_info else "augmented_keys"
         keys = given or ()
         if not given and task in GYMNASIUM_IDS:
-            keys = getattr(registry.configure("env", {"name": task}).spec, name)
+            stated = getattr(registry.configure("env", {"name": task}).spec, name)
+            keys = [GYMNASIUM_NAMES.get(key, key) for key in stated]
         got = f"{shortened(task)}, whose info is not known here"
         require(keys, "info_keys", f"must be `sejax.Task.{name}`; got none for {got}.")
-        return tuple(keys if given else [GYMNASIUM_NAMES.get(key, key) for key in keys])
+        return tuple(keys)
 
 
 def _require_task(env: Env, header: Header) -> None:
@@ -178,21 +168,21 @@ def _require_task(env: Env, header: Header) -> None:
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
-    own, wanted = env.observation_space, learned.observation_space
-    is_as_it_is = _kind(layers[-1].observation_space) == _kind(wanted)  # made so by no wrapper
-    changed = [x for x in layers if isinstance(x, ObservationWrapper)]
-    changed = [x for x in changed if is_as_it_is and not isinstance(x, SAME_NUMBERS)]
+    obs_kind = _kind(learned.observation_space)
+    is_as_it_is = _kind(layers[-1].observation_space) == obs_kind  # made so by no wrapper
+    changed = [x for x in layers if is_as_it_is and isinstance(x, ObservationWrapper)]
+    changed = [x for x in changed if not isinstance(x, SAME_NUMBERS)]
     # Wrappers may make actions of one kind of another: some layer has the task's.
-    acts = {_kind(layer.action_space) for layer in layers}
-    must = f"must be of {shortened(header.task)}, with"
-    is_other = isinstance(env.unwrapped, CliffWalkingEnv)
-    require(not is_other, "env", f"{must} sejax's actions and falls; got {shortened(env)}.")
-    is_seen = _kind(own) == _kind(wanted)
-    require(is_seen, "env", f"{must} the observations {wanted}; got {shortened(own)}.")
-    has_actions = acts & {_kind(learned.action_space), None}
-    require(has_actions, "env", f"{must} its actions; got {shortened(env.action_space)}.")
-    got = f"observations that no wrapper below has changed; got {shortened(changed[:1])}."
-    require(not changed, "env", f"{must} {got}")
+    action_kinds = {_kind(layer.action_space) for layer in layers}
+    is_seen = _kind(env.observation_space) == obs_kind
+    for holds, must, got in (
+        (not isinstance(env.unwrapped, CliffWalkingEnv), "sejax's actions and falls", env),
+        (is_seen, f"the observations {learned.observation_space}", env.observation_space),
+        (action_kinds & {_kind(learned.action_space), None}, "its actions", env.action_space),
+        (not changed, "observations that no wrapper below has changed", changed[:1]),
+    ):
+        message = f"must be of {shortened(header.task)}, with {must}; got {shortened(got)}."
+        require(holds, "env", message)
 
 
 def _kind(space: Space[Any]) -> tuple[bool, int] | None:

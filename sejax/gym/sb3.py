@@ -1,7 +1,6 @@
 """Many episodes of an SE as a `VecEnv` of Stable-Baselines3; the extra `sb3` is needed."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -51,13 +50,3 @@ class SyntheticVecEnv(DummyVecEnv):
                 infos[i]["terminal_observation"] = obs[i]
             obs, _ = self._episodes.reset(options={"reset_mask": dones})
         return obs, rewards.astype(np.float32), dones, infos
-
-    def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """Calls a method of each environment.
-
-        Raises:
-          NotImplementedError: for `reset` and `step`, which all environments do together.
-        """
-        if method_name in ("reset", "step"):
-            raise NotImplementedError(f"environments {method_name} together: call it on the VecEnv")
-        return super().env_method(method_name, *args, **kwargs)

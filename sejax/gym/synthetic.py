@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,17 +23,8 @@ from sejax.proxies.synthetic import SyntheticConfig
 
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
+LIMIT = np.float32(MAX_ABS_VALUE)
 Numbers = np.ndarray | float
-
-
-class Step(NamedTuple):
-    """What a step comes to: of one episode numbers, of several arrays `[batch]`."""
-
-    vector: np.ndarray  # [*batch, obs_dim]
-    reward: Any
-    terminated: Any
-    truncated: Any
-    discount: Any
 
 
 class SyntheticWorld:
@@ -76,8 +67,8 @@ class SyntheticWorld:
         self._start_layers = networks.layers_of(weights, "start")
         heads = [networks.layers_of(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
-        fix = "got None. Set RealTask(starts=...)."
-        require(self.draws_noise or task.starts, "task.starts", f"must draw initial states; {fix}")
+        must = "must draw initial states; got None. Set RealTask(starts=...)."
+        require(self.draws_noise or task.starts, "task.starts", must)
         self._starts: Any = task.starts  # not None if it is called
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 
@@ -98,7 +89,7 @@ class SyntheticWorld:
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
         vector = vector if self._units is None else self._units.decode(vector)
-        return np.minimum(np.maximum(vector, np.float32(-MAX_ABS_VALUE)), np.float32(MAX_ABS_VALUE))
+        return np.minimum(np.maximum(vector, -LIMIT), LIMIT)
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
@@ -111,12 +102,12 @@ class SyntheticWorld:
         Raises:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
-        if isinstance(self.action_space, spaces.Discrete):
-            if not space.shape and space.contains(action):
+        if isinstance(space, spaces.Discrete):
+            if space.contains(action):
                 return self._one_hot[int(action)]
+        elif isinstance(self.action_space, spaces.Discrete):
             array = np.asarray(action)  # also of bools, which would be a mask
-            is_whole = array.shape == space.shape and array.dtype.kind in "biu"
-            if space.shape and is_whole and space.contains(array):
+            if array.dtype.kind in "biu" and space.contains(array):
                 return self._one_hot[array.astype(np.intp)]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
@@ -125,7 +116,7 @@ class SyntheticWorld:
 
     def step(
         self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
-    ) -> Step:
+    ) -> tuple[np.ndarray, Any, Any, Any, Any]:
         """One step of each episode.
 
         Args:
@@ -133,6 +124,10 @@ class SyntheticWorld:
           action: from `encode`, `[*batch, action_dim]`.
           time: steps of the episode with this one, `[*batch]`.
           chance: uniform in [0, 1), `[*batch]`, if `draws_ends`.
+
+        Returns:
+          `(vector, reward, terminated, truncated, discount)`: the next state, `[*batch, obs_dim]`;
+          the others `[*batch]`, of one episode numbers.
         """
         outputs = self._predict(action, vector)  # [*batch, obs_dim + 2]
         absurd: Any = False
@@ -151,7 +146,7 @@ class SyntheticWorld:
         if self.config.ends_at_horizon:
             terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
-        return Step(outputs[..., :-2], reward, terminated, truncated, discount)
+        return outputs[..., :-2], reward, terminated, truncated, discount
 
     def observe(self, vector: np.ndarray) -> Any:
         """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
@@ -233,15 +228,11 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         encoded = self.world.encode(action, self.action_space)
         self._time += 1
         chance = self.np_random.random() if self.world.draws_ends else None
-        step = self.world.step(self._vector, encoded, self._time, chance)
-        terminated, truncated = bool(step.terminated), bool(step.truncated)
-        self._vector = None if terminated or truncated else step.vector
-        info = {"discount": float(step.discount)}
-        return self.world.observe(step.vector), float(step.reward), terminated, truncated, info
-
-    def render(self) -> NoReturn:
-        """Raises `NotImplementedError`: the states of an SE have no picture."""
-        raise NotImplementedError("an SE's states have no picture: render its real task")
+        vector, reward, *ends, discount = self.world.step(self._vector, encoded, self._time, chance)
+        terminated, truncated = map(bool, ends)
+        self._vector = None if terminated or truncated else vector
+        info = {"discount": float(discount)}
+        return self.world.observe(vector), float(reward), terminated, truncated, info
 
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
@@ -264,9 +255,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        if not isinstance(autoreset_mode, AutoresetMode):
-            one_of([mode.value for mode in AutoresetMode])("autoreset_mode", autoreset_mode, None)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        one_of([x.value for x in AutoresetMode])("autoreset_mode", mode, None)
+        self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space
@@ -296,15 +287,13 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         Raises:
           ConfigError: for seeds or a mask of another length.
         """
-        n = self.num_envs
-        seeds = seed
+        n, seeds = self.num_envs, seed
         if seeds is None or isinstance(seeds, int | np.integer):
             seeds = [None if seeds is None else int(seeds) + i for i in range(n)]
         mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
         require(len(seeds) == n, "seed", f"must be one number, or {n}; got {len(seeds)}.")
-        is_mask = mask.shape == (n,) and mask.dtype == np.bool_
-        got = f"{mask.shape} of {mask.dtype}"
-        require(is_mask, "options.reset_mask", f"must be [{n}] of bool; got {got}.")
+        got, wanted = f"{mask.dtype}{list(mask.shape)}", f"bool[{n}]"
+        require(got == wanted, "options.reset_mask", f"must be {wanted}; got {got}.")
         for i in np.flatnonzero(mask).tolist():
             if self._np_random[i] is None or seeds[i] is not None:
                 self._np_random[i], self._np_random_seed[i] = seeding.np_random(seeds[i])
@@ -321,8 +310,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
           gymnasium.error.ResetNeeded: if an environment has no episode that goes on.
           gymnasium.error.InvalidAction: for actions that are none of the space's.
         """
-        is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        if None in self._np_random or (self._ended.any() and not is_next_step):
+        begins_itself = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        if None in self._np_random or (self._ended.any() and not begins_itself):
             raise ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
         on = ~self._ended  # the others begin an episode
@@ -333,26 +322,20 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             chances = None
             if self.world.draws_ends:
                 chances = np.array([self._np_random[i].random() for i in np.flatnonzero(on)])
-            step = self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
-            self._vectors[on], rewards[on], discounts[on] = step.vector, step.reward, step.discount
-            terminated[on], truncated[on] = step.terminated, step.truncated
+            self._vectors[on], rewards[on], terminated[on], truncated[on], discounts[on] = (
+                self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
+            )
         self._begin(self._ended)
         self._ended = ended = terminated | truncated
         infos = _told(discounts, on)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos = self._finals(ended, discounts)
+            obs, final_obs = self.world.observe(self._vectors), np.full(self.num_envs, None)
+            for i in np.flatnonzero(ended):
+                final_obs[i] = obs[i]
+            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
+            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
             self._begin(ended)
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
-
-    def _finals(self, ended: np.ndarray, discounts: np.ndarray) -> Info:
-        """Infos of a step whose ended environments begin anew at once."""
-        obs = self.world.observe(self._vectors)
-        final_obs = np.full(self.num_envs, None)
-        for i in np.flatnonzero(ended):
-            final_obs[i] = obs[i]
-        finals = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-        masks = {"_final_obs": ended, "_final_info": ended}
-        return finals | masks | _told(discounts, ~ended)
 
     def _begin(self, mask: np.ndarray) -> None:
         """Puts environments at the beginning of an episode."""

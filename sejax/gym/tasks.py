@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import TimeLimit
 
-from sejax.envs import gridworld
+from sejax import envs
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
 from sejax.options import ConfigError, registry, require, shortened, told
 from sejax.options.plain import to_plain
@@ -34,6 +34,7 @@ GYMNASIUM_IDS = {
     "ant": "Ant-v5",
     "reacher": "Reacher-v5",
 }
+GRIDS = ("cliff_walking", "gridworld_2x2")
 GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
 
 Env = gymnasium.Env[Any, Any]
@@ -130,10 +131,9 @@ def real_env(header: Header, fix: str, **options: Any) -> Env:
       ConfigError: if there is none, for an option that the task does not have here, or if Gymnasium
         cannot make it.
     """
-    config = header.config["env"]
-    limit = header.spec.max_steps
+    config, limit = header.config["env"], header.spec.max_steps
     name = str(config.get("name"))
-    is_known = name in GYMNASIUM_IDS or name in MAPS
+    is_known = name in GYMNASIUM_IDS or name in GRIDS
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
@@ -143,7 +143,7 @@ def real_env(header: Header, fix: str, **options: Any) -> Env:
         f"must be given, because Gymnasium has none that is the same; got {shortened(config)}. Set "
         f"{fix}, or an id of Gymnasium.",
     )
-    if name in MAPS:
+    if name in GRIDS:
         return TimeLimit(GridWorld(name, **fields), limit)
     return make_gymnasium(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 
@@ -162,52 +162,35 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     """
     learned = RealTask.of_spec(header.spec)
     limit = learned.max_steps
-    if task is None and not config.needs_task:
-        return learned
-    # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
-    gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
-    if task is None and gymnax_id in gymnasium.registry:
-        task = gymnax_id
     if task is None:
-        task = RealTask.of_env(real_env(header, "task=sejax.gym.RealTask(...)"))
+        if not config.needs_task:
+            return learned
+        # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
+        gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
+        is_known = gymnax_id in gymnasium.registry
+        fix = "task=sejax.gym.RealTask(...)"
+        task = gymnax_id if is_known else RealTask.of_env(real_env(header, fix))
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task, limit)
-    got = f"got {shortened(task)}. Set task=sejax.gym.RealTask.of_env(env)."
-    require(isinstance(task, RealTask), "task", f"must be a RealTask or an id of Gymnasium; {got}")
-    actions = task.action_space
-    wanted = learned.action_space
-    has_actions = is_same_space(space_of(actions, "task.action_space"), header.spec.action)
-    got = f"got {shortened(actions)}. gymnasium.wrappers.RescaleAction makes such."
-    require(has_actions, "task", f"must have the actions of the SE's task, {wanted}; {got}")
-    has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
-    got = f"got {task.max_steps}. Set max_steps={limit}."
-    require(has_limit, "task", f"must have the step limit {limit} of the SE's task; {got}")
+    require(
+        isinstance(task, RealTask),
+        "task",
+        f"must be a RealTask or an id of Gymnasium; got {shortened(task)}. Set "
+        "task=sejax.gym.RealTask.of_env(env).",
+    )
+    action = space_of(task.action_space, "task.action_space")
+    require(
+        is_same_space(action, header.spec.action)
+        and config.max_steps(task.max_steps) == config.max_steps(limit),
+        "task",
+        f"must have the actions and the step limit of the SE's task, {learned.action_space} and "
+        f"{limit}; got {shortened(task.action_space)} and {task.max_steps}. Set max_steps={limit}, "
+        "or wrap it in gymnasium.wrappers.RescaleAction.",
+    )
     return task
 
 
-def rn_env(header: Header, env_id: RealTask | str | None, render_mode: str | None) -> Env:
-    """The task of an RN: one that is given by its id, or the file's.
-
-    Raises:
-      ConfigError: for an id that is not a string, or if the task must be given.
-    """
-    fix = "sejax.gym.RewardNetwork(env, source)"
-    if env_id is None:
-        return real_env(header, fix, render_mode=render_mode)
-    got = shortened(env_id)
-    require(isinstance(env_id, str), "task", f"must be an id of Gymnasium; got {got}. Set {fix}.")
-    return make_gymnasium(str(env_id), render_mode=render_mode)
-
-
 # --- grid worlds ----------------------------------------------------------------------------------
-
-MAPS = {"cliff_walking": gridworld.CLIFF_WALKING, "gridworld_2x2": gridworld.ROOM_2X2}
-# Reward of a step into each cell: the start, the floor, the goal and a hole.
-REWARDS = {
-    "cliff_walking": {"S": -1.0, " ": -1.0, "G": 0.0, "O": -100.0},
-    "gridworld_2x2": {"S": -0.01, " ": -0.01, "G": 1.0, "O": -1.0},
-}
-MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 
 
 class GridWorld(gymnasium.Env[int, int]):
@@ -234,23 +217,21 @@ class GridWorld(gymnasium.Env[int, int]):
     """
 
     def __init__(self, name: str, goal_reward: float | None = None):
-        self._cells = "".join(MAPS[name])
-        height, width = len(MAPS[name]), len(MAPS[name][0])
-        around = np.pad(np.arange(height * width).reshape(height, width), 1, mode="edge")
-        # [action][index]: where a move leads to
-        self._next = [around[1 + y :, 1 + x :][:height, :width].ravel().tolist() for y, x in MOVES]
-        self._rewards = REWARDS[name] | ({} if goal_reward is None else {"G": goal_reward})
+        task = envs.make(name)
+        self._world: Any = task.env
+        params: Any = task.params
+        self._params = params if goal_reward is None else params.replace(goal_reward=goal_reward)
         self._index: int | None = None
-        self.observation_space = spaces.Discrete(len(self._cells))
-        self.action_space = spaces.Discrete(len(MOVES))
+        self.observation_space = spaces.Discrete(task.obs_dim)
+        self.action_space = spaces.Discrete(task.action_dim)
         arguments = {"name": name, "goal_reward": goal_reward}
         self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=arguments)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
         """Puts the agent on the map's S; `options` has no effect."""
         super().reset(seed=seed)
-        self._index = self._cells.index("S")
-        return self._index, {}
+        self._index = start = self._world._start
+        return start, {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, Info]:
         """Moves by one cell.
@@ -263,10 +244,12 @@ class GridWorld(gymnasium.Env[int, int]):
             raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"{action!r} is none of {self.action_space}")
-        obs = self._next[action][self._index]
-        cell = self._cells[obs]
-        self._index = None if cell in "GO" else obs
-        return obs, self._rewards[cell], cell in "GO", False, {}
+        obs, params = int(self._world._next[self._index, action]), self._params
+        is_goal, is_hole = bool(self._world._goal[obs]), bool(self._world._hole[obs])
+        at_end = params.goal_reward if is_goal else params.hole_reward
+        terminated = is_goal or is_hole
+        self._index = None if terminated else obs
+        return obs, at_end if terminated else params.step_reward, terminated, False, {}
 
 
 # --- spaces ---------------------------------------------------------------------------------------
@@ -275,7 +258,7 @@ class GridWorld(gymnasium.Env[int, int]):
 def _gymnasium_space(space: Space) -> spaces.Space[Any]:
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
-    low, high = (np.array(bound, np.float32) for bound in (space.low, space.high))
+    low, high = np.array([space.low, space.high], np.float32)
     return spaces.Box(low, high, dtype=np.float32)
 
 

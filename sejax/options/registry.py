@@ -96,7 +96,7 @@ GROUPS = {
             "ant": "sejax.envs.mujoco.tasks:Ant",
             "reacher": "sejax.envs.mujoco.tasks:Reacher",
         },
-        {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.stoa:StoaTask"},
+        {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"},
     ),
     "agent": Group(
         "sejax.agents",

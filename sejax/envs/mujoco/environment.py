@@ -1,6 +1,7 @@
-"""What the MuJoCo tasks have in common: an environment on `Physics`."""
+"""What the MuJoCo tasks have in common: their configuration, and an environment on `Physics`."""
 
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -8,15 +9,120 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, UInt32
 
+from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
-from sejax.envs.mujoco import physics
-from sejax.envs.mujoco.physics import Report
+from sejax.envs.spec import TaskSpec
+from sejax.options import ConfigError, Options
 
-if TYPE_CHECKING:
-    from sejax.envs.mujoco.tasks import MujocoTask
+if TYPE_CHECKING:  # it imports mujoco
+    from sejax.envs.mujoco.physics import Physics, Report
 
-Config = TypeVar("Config", bound="MujocoTask")
 Scalars = dict[str, Float[Array, ""]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MujocoTask(Options):
+    """A task of Gymnasium: its options, which are keyword arguments there, and its equations.
+
+    A subclass says what is in the class attributes and in the methods `rewards`, `is_healthy`,
+    `more_info` and `observe`.
+
+    Attributes:
+      name: of the task.
+      file: of the model, among Gymnasium's.
+      frame_skip: MuJoCo's steps in one step.
+      num_hidden: positions that are not observed, the first ones.
+      with_forces: whether external forces are needed.
+      normal_velocities: whether those of a reset are normal, else uniform.
+      otherwise: what else can be done where MuJoCo cannot be used, for messages.
+      terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some.
+      reset_noise_scale: range or deviation of what is drawn at a reset; an option of some.
+    """
+
+    group: ClassVar[str] = "env"
+    name: ClassVar[str]
+    file: ClassVar[str]
+    frame_skip: ClassVar[int]
+    num_hidden: ClassVar[int] = 1
+    with_forces: ClassVar[bool] = False
+    normal_velocities: ClassVar[bool] = False
+    otherwise: ClassVar[str] = ""
+    terminate_when_unhealthy = True
+    reset_noise_scale = 0.1
+
+    @property
+    def spec(self) -> TaskSpec:
+        """What is known of the task."""
+        raise NotImplementedError
+
+    def make(self) -> Task:
+        """The task.
+
+        Raises:
+          ConfigError: without the extra `mujoco`, a C++ compiler that works or a CPU as jax's
+            default device.
+        """
+        field = f"env={self.name}"
+        try:
+            import gymnasium  # noqa: F401, whose models are read
+            import mujoco  # noqa: F401
+        except ImportError as error:
+            fix = f"Install them with pip install 'sejax[mujoco]'{self.otherwise}."
+            message = f"{field} needs MuJoCo and Gymnasium; {error}. {fix}"
+            raise ConfigError(message, "env") from error
+        from sejax.envs.mujoco import library
+
+        if (backend := jax.default_backend()) != "cpu":
+            fix = f"Set JAX_PLATFORMS=cpu{self.otherwise}."
+            raise ConfigError(f"{field} must run on the CPU; got {backend}. {fix}", "env")
+        try:
+            library.load()
+        except library.BuildError as error:
+            message = f"{field} needs a library of its own; {error}{self.otherwise}."
+            raise ConfigError(message, "env") from error
+        return Task.of(self.spec, name=self.name, env=MujocoEnv(self))
+
+    @property
+    def physics(self) -> "Physics":
+        """Of the task's model."""
+        from sejax.envs.mujoco.physics import of_gymnasium
+
+        return of_gymnasium(self.file, self.frame_skip, self.with_forces)
+
+    def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+        """Positions and velocities of a reset: the model's own pose at rest, and noise.
+
+        Noise is uniform in +-`reset_noise_scale`, or normal with that deviation.
+        """
+        key_qpos, key_qvel = jax.random.split(key)
+        model, scale = self.physics.model, self.reset_noise_scale
+        noise = jax.random.uniform(key_qpos, (model.nq,), minval=-scale, maxval=scale)
+        qpos = noise + np.float32(model.qpos0)
+        if self.normal_velocities:
+            return qpos, scale * jax.random.normal(key_qvel, (model.nv,))
+        return qpos, jax.random.uniform(key_qvel, (model.nv,), minval=-scale, maxval=scale)
+
+    def observe(self, now: "Report") -> Float[Array, " obs_dim"]:
+        """The observation: positions and velocities."""
+        return jnp.concatenate([now.qpos[self.num_hidden :], now.qvel])
+
+    def is_healthy(self, now: "Report") -> Bool[Array, ""]:
+        """Whether the episode can go on, for tasks that terminate."""
+        return jnp.bool_(True)
+
+    def rewards(
+        self, now: "Report", action: Float[Array, " nu"], healthy: Bool[Array, ""]
+    ) -> Scalars:
+        """The parts of the reward, by Gymnasium's names."""
+        raise NotImplementedError
+
+    def more_info(self, now: "Report") -> Scalars:
+        """What else is in `info`."""
+        return {}
+
+    def velocity(self, now: "Report") -> Float[Array, " axes"]:
+        """The body's velocity in the step along x and further axes, in m/s."""
+        return now.qpos_change / self.physics.dt
 
 
 @struct.dataclass
@@ -24,70 +130,23 @@ class MujocoState(EnvState):
     physics: UInt32[Array, " num_words"]  # as of `Physics`
 
 
-class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
+class MujocoEnv(Environment[MujocoState, EnvParams]):
     """A task of Gymnasium, equal to it step by step but for rounding to single precision.
 
-    A subclass says what is in the class attributes and in the methods `rewards`, `is_healthy`,
-    `more_info` and `observe_report`. As in Gymnasium, the reward is the sum of the parts
-    that `info` lists, and actions beyond their bounds are clipped by MuJoCo and charged as they
-    are.
-
-    Attributes:
-      config: the task's configuration, whose fields are Gymnasium's keyword arguments.
-      physics: of its model.
+    As in Gymnasium, the reward is the sum of the parts that `info` lists, and actions beyond their
+    bounds are clipped by MuJoCo and charged as they are.
     """
 
-    file: ClassVar[str]  # of the model, among Gymnasium's
-    frame_skip: ClassVar[int]
-    num_hidden: ClassVar[int]  # positions that are not observed, the first ones
-    with_forces: ClassVar[bool] = False  # whether external forces are needed
-    normal_velocities: ClassVar[bool] = False  # those of a reset, else uniform
-
-    def __init__(self, config: Config):
-        super().__init__(config.spec)
-        self.config = config
-        self.physics = physics.of_gymnasium(self.file, self.frame_skip, self.with_forces)
-        self._qpos0 = np.asarray(self.physics.model.qpos0, np.float32)
-
-    def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-        """Positions and velocities of a reset: the model's own pose at rest, and noise.
-
-        Noise is uniform in +-`config.reset_noise_scale`, or normal with that deviation.
-        """
-        key_qpos, key_qvel = jax.random.split(key)
-        nq, nv, scale = self.physics.model.nq, self.physics.model.nv, self.config.reset_noise_scale
-        qpos = jax.random.uniform(key_qpos, (nq,), minval=-scale, maxval=scale) + self._qpos0
-        if self.normal_velocities:
-            return qpos, scale * jax.random.normal(key_qvel, (nv,))
-        return qpos, jax.random.uniform(key_qvel, (nv,), minval=-scale, maxval=scale)
-
-    def observe_report(self, now: Report) -> Float[Array, " obs_dim"]:
-        """The observation: positions and velocities."""
-        return jnp.concatenate([now.qpos[self.num_hidden :], now.qvel])
-
-    def is_healthy(self, now: Report) -> Bool[Array, ""]:
-        """Whether the episode can go on, for tasks that terminate."""
-        return jnp.bool_(True)
-
-    def rewards(
-        self, now: Report, action: Float[Array, " nu"], healthy: Bool[Array, ""]
-    ) -> Scalars:
-        """The parts of the reward, by Gymnasium's names."""
-        raise NotImplementedError
-
-    def more_info(self, now: Report) -> Scalars:
-        """What else is in `info`."""
-        return {}
-
-    def velocity(self, now: Report) -> Float[Array, " axes"]:
-        """The body's velocity in the step along x and further axes, in m/s."""
-        return now.qpos_change / self.physics.dt
+    def __init__(self, task: MujocoTask):
+        super().__init__(task.spec)
+        self.task = task
+        self.physics = task.physics
 
     def reset_env(
         self, key: Array, params: EnvParams
     ) -> tuple[Float[Array, " obs_dim"], MujocoState]:
-        state, now = self.physics.reset(*self.draw_start(key))
-        return self.observe_report(now), MujocoState(physics=state, time=jnp.int32(0))
+        state, now = self.physics.reset(*self.task.draw_start(key))
+        return self.task.observe(now), MujocoState(physics=state, time=jnp.int32(0))
 
     def step_env(
         self, key: Array, state: MujocoState, action: Array, params: EnvParams
@@ -95,26 +154,10 @@ class MujocoEnv(Environment[MujocoState, EnvParams], Generic[Config]):
         """One control step of `physics.dt` seconds; the key has no effect."""
         action = jnp.asarray(action, jnp.float32)
         after, now = self.physics.step(state.physics, action)
-        healthy = self.is_healthy(now)
-        terminated = ~healthy & self.config.terminate_when_unhealthy
-        rewards = self.rewards(now, action, healthy)
-        info = {**self.more_info(now), **rewards, "discount": jnp.where(terminated, 0.0, 1.0)}
+        healthy = self.task.is_healthy(now)
+        terminated = ~healthy & self.task.terminate_when_unhealthy
+        rewards = self.task.rewards(now, action, healthy)
+        info = {**self.task.more_info(now), **rewards, "discount": jnp.where(terminated, 0.0, 1.0)}
         reward = sum(rewards.values(), jnp.float32(0))
         state = MujocoState(physics=after, time=state.time + 1)
-        return self.observe_report(now), state, reward, terminated, info
-
-
-def control_cost(action: Float[Array, " nu"], weight: float) -> Float[Array, ""]:
-    """The part of the reward that charges for control."""
-    return -weight * jnp.sum(action**2)
-
-
-def plane(position: Float[Array, " axes"], velocity: Float[Array, " axes"]) -> Scalars:
-    """What Gymnasium's `info` has of a body that moves in a plane; x and y are the first axes."""
-    return {
-        "x_position": position[0],
-        "y_position": position[1],
-        "distance_from_origin": jnp.linalg.norm(position[:2]),
-        "x_velocity": velocity[0],
-        "y_velocity": velocity[1],
-    }
+        return self.task.observe(now), state, reward, terminated, info
