@@ -20,7 +20,7 @@ OBS_DIM = 3
 def task_with(action):
     """A task of which only the spaces count."""
     spec = TaskSpec(observation=Box.symmetric(*[9.0] * OBS_DIM), action=action, max_steps=7)
-    return Task.of(spec, name="spaces", env=AbsentEnv("spaces", spec, "it has no dynamics"))
+    return Task.of(spec, name="spaces", env=AbsentEnv(spec, "it has no dynamics"))
 
 
 TASKS = {"continuous": task_with(Box.symmetric(0.5, 0.5)), "discrete": task_with(Discrete(3))}
