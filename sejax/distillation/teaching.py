@@ -28,6 +28,7 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
+LESSON = ("generation", "policy_return")
 COLUMNS = ("test_return", "train_steps", "real_steps", "cpu_s")  # of a student
 
 
@@ -51,23 +52,16 @@ def students(
       keys: of the students, `[student]`, the same on all SEs.
       store: where students are kept.
     """
-    tables = []
     # By the weights, as what `policy` names may have changed.
-    taught_by = fingerprint({str(i): each for i, each in enumerate(weights)})
-    lesson, student = (x.ravel().tolist() for x in np.indices((len(lessons), len(keys))))
+    taught_by = fingerprint({str(i): se_weights for i, se_weights in enumerate(weights)})
+    rows = pd.DataFrame([lesson[::3] for lesson in lessons], columns=LESSON).assign(agent="")
+    rows = rows.merge(pd.DataFrame({"student": range(len(keys))}), how="cross")
+    tables = []
     for key, agent_config in config.agents.items():
         agent = make_agent(agent_config, env.task, config.exploration)
         train = functools.partial(teach, env, weights, agent, config.training, keys, config.devices)
         taught = store.once(f"students/{key}-{taught_by}", train)
-        table = pd.DataFrame(
-            {
-                "generation": [lessons[i].generation for i in lesson],
-                "policy_return": [lessons[i].policy_return for i in lesson],
-                "agent": key,
-                "student": student,
-                **{column: taught[column] for column in COLUMNS},
-            }
-        )
+        table = rows.assign(agent=key, **{column: taught[column] for column in COLUMNS})
         returns = counted(table["test_return"])
         mean, worst = returns.mean(), returns.min()
         print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}", flush=True)
@@ -102,10 +96,9 @@ def teach(
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
     se, student = (indices.ravel() for indices in np.indices((len(weights), len(keys))))
     print(f"training {len(se)} students ...", flush=True)
+    width = num_parallel_on_cpu(agent, training)
     spread = spread_over_devices(
-        lambda key, one: evaluate(key, env.params(one)),
-        devices,
-        cpu_num_parallel=num_parallel_on_cpu(agent, training),
+        lambda key, one: evaluate(key, env.params(one)), devices, cpu_num_parallel=width
     )
 
     def train_all(keys: Array, stacked: PyTree) -> Outcome:
@@ -114,12 +107,10 @@ def teach(
     program = jax.jit(train_all, compiler_options=compiler_options())
     outcome: Outcome = jax.device_get(program(keys, stacked))
     means = np.asarray(outcome.test_returns, float).mean(axis=-1)
-    return {
-        "test_return": np.where(outcome.nonfinite, np.nan, means),
-        "train_steps": np.asarray(outcome.train_steps),
-        "real_steps": np.asarray(outcome.real_steps),
-        "cpu_s": np.full(len(se), (time.process_time() - started) / len(se)),
-    }
+    cpu_s = (time.process_time() - started) / len(se)
+    returns = np.where(outcome.nonfinite, np.nan, means)
+    values = returns, outcome.train_steps, outcome.real_steps, np.full(len(se), cpu_s)
+    return dict(zip(COLUMNS, map(np.asarray, values), strict=True))
 
 
 def counted(returns: pd.Series) -> pd.Series:
