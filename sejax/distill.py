@@ -208,15 +208,12 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     }
     path, plain = folder / "proxy.safetensors", configuration.plain(config)
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
-    record = {
-        "generation": lessons[best].generation,
-        "seed": config.seed,
-        "policy_return": lessons[best].policy_return,
-        "evaluations": evaluations_of(tested),
-    }
-    save(path, env, weights[best], learned_with, **record, learning=learning)
+    generation, _, _, policy_return = lessons[best]
+    record = {"generation": generation, "seed": config.seed, "policy_return": policy_return}
+    record |= {"evaluations": evaluations_of(tested), "learning": learning}
+    save(path, env, weights[best], learned_with, **record)
     write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
-    print(f"{path} holds the SE of generation {lessons[best].generation}.")
+    print(f"{path} holds the SE of generation {generation}.")
     return path
 
 

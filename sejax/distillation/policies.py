@@ -173,7 +173,7 @@ def copied(
         layers = fit(config, task, states, actions, scale, key_fit)
     tested, copy_return = visit(task, acting(task, layers), key, config.episodes)
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
-    real_steps = len(states) + len(tested) + (config.agent_steps if is_agent(policy) else 0)
+    real_steps = len(states) + len(tested) + config.agent_steps * is_agent(policy)
     costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
     return [Lesson(0, layers, own_states, policy_return)], pd.DataFrame(costs)
 
@@ -269,10 +269,9 @@ def fit(
     key_init, key_fit = jax.random.split(key)
     sizes = [task.obs_dim, *[config.hidden_size] * (config.hidden_size > 0), task.action_dim]
     keys = jax.random.split(key_init, len(sizes) - 1)
-    params = [
-        (jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out))
-        for k, (n_in, n_out) in zip(keys, itertools.pairwise(sizes), strict=True)
-    ]
+    params = []
+    for k, (n_in, n_out) in zip(keys, itertools.pairwise(sizes), strict=True):
+        params.append((jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out)))
     optimiser = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.steps))
 
     def loss(params: Any, key: Array) -> Array:
@@ -292,11 +291,10 @@ def fit(
 
     keys = jax.random.split(key_fit, config.steps)
     run = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys)[0][0])
-    fitted = [
-        (np.asarray(k, float), np.asarray(b, float)) for k, b in run(params, optimiser.init(params))
-    ]
-    kernel, bias = fitted[0]
-    fitted[0] = (kernel / std, bias - (kernel / std) @ mean)
-    kernel, bias = fitted[-1]
-    fitted[-1] = (task.max_action * kernel, task.max_action * bias)
-    return fitted
+    fitted = run(params, optimiser.init(params))
+    layers = [(np.asarray(k, float), np.asarray(b, float)) for k, b in fitted]
+    kernel, bias = layers[0]
+    layers[0] = (kernel / std, bias - (kernel / std) @ mean)
+    kernel, bias = layers[-1]
+    layers[-1] = (task.max_action * kernel, task.max_action * bias)
+    return layers

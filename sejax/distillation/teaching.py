@@ -18,9 +18,7 @@ from jaxtyping import Array, PyTree
 from sejax.agents import make_agent
 from sejax.agents.base import Agent
 from sejax.distillation.policy_search import Lesson
-from sejax.evaluation import make_evaluator, num_parallel_on_cpu
-from sejax.objectives import Outcome
-from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.io import fingerprint
@@ -28,7 +26,6 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
-LESSON = ("generation", "policy_return")
 COLUMNS = ("test_return", "train_steps", "real_steps", "cpu_s")  # of a student
 
 
@@ -54,7 +51,8 @@ def students(
     """
     # By the weights, as what `policy` names may have changed.
     taught_by = fingerprint({str(i): se_weights for i, se_weights in enumerate(weights)})
-    rows = pd.DataFrame([lesson[::3] for lesson in lessons], columns=LESSON).assign(agent="")
+    policies = [(lesson.generation, lesson.policy_return) for lesson in lessons]
+    rows = pd.DataFrame(policies, columns=["generation", "policy_return"]).assign(agent="")
     rows = rows.merge(pd.DataFrame({"student": range(len(keys))}), how="cross")
     tables = []
     for key, agent_config in config.agents.items():
@@ -92,24 +90,14 @@ def teach(
       that diverged; `train_steps`; `real_steps`; `cpu_s`, the mean CPU seconds of a student.
     """
     started = time.process_time()
-    evaluate = make_evaluator(agent, env, env.task, training)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
-    se, student = (indices.ravel() for indices in np.indices((len(weights), len(keys))))
-    print(f"training {len(se)} students ...", flush=True)
-    width = num_parallel_on_cpu(agent, training)
-    spread = spread_over_devices(
-        lambda key, one: evaluate(key, env.params(one)), devices, cpu_num_parallel=width
-    )
-
-    def train_all(keys: Array, stacked: PyTree) -> Outcome:
-        return spread(keys[student], jax.tree.map(lambda leaf: leaf[se], stacked))
-
-    program = jax.jit(train_all, compiler_options=compiler_options())
-    outcome: Outcome = jax.device_get(program(keys, stacked))
-    means = np.asarray(outcome.test_returns, float).mean(axis=-1)
-    cpu_s = (time.process_time() - started) / len(se)
-    returns = np.where(outcome.nonfinite, np.nan, means)
-    values = returns, outcome.train_steps, outcome.real_steps, np.full(len(se), cpu_s)
+    print(f"training {len(weights) * len(keys)} students ...", flush=True)
+    evaluate = functools.partial(evaluate_agents, agent, env, devices=devices)
+    outcomes = [evaluate(env.params(x), env.task, training, keys) for x in weights]
+    outcome = jax.device_get(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outcomes))
+    returns = np.asarray(outcome.test_returns, float).mean(axis=-1)
+    returns = np.where(outcome.nonfinite, np.nan, returns)
+    cpu_s = np.full(len(returns), (time.process_time() - started) / len(returns))
+    values = returns, outcome.train_steps, outcome.real_steps, cpu_s
     return dict(zip(COLUMNS, map(np.asarray, values), strict=True))
 
 

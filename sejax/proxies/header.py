@@ -17,15 +17,7 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import (
-    LARGEST,
-    ConfigError,
-    is_number,
-    registry,
-    require,
-    shortened,
-    unknown_name,
-)
+from sejax.options import LARGEST, ConfigError, is_number, one_of, registry, require, shortened
 from sejax.options.plain import expanded, from_plain
 from sejax.proxies import hub
 
@@ -192,7 +184,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         there = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError(f"{option} {there}; got {shortened(name)}, where there is none.", option)
     if name not in pretrained_names():
-        raise unknown_name(option, shortened(name), [*pretrained_names(), *also])
+        one_of([*pretrained_names(), *also])(option, shortened(name), None)
     return PRETRAINED_DIR / f"{name}.safetensors"
 
 

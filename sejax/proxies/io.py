@@ -22,6 +22,7 @@ from sejax.envs.environment import Environment
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, shortened, told, unknown_name
+from sejax.options.parts import require_part
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
@@ -155,14 +156,9 @@ class ProxySet(_Loaded):
             records = tuple(self.records[number] for number in numbers)
             return dataclasses.replace(self, weights=weights, records=records)
         params = self.env.params(jax.tree.map(jax.numpy.asarray, weights), self.discount)
-        return Proxy(
-            env=self.env.with_default_params(params, self.config),
-            params=params,
-            record=self.records[numbers],
-            config=self.config,
-            discount=self.discount,
-            path=self.path,
-        )
+        shared = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Loaded)}
+        shared["env"] = self.env.with_default_params(params, self.config)
+        return Proxy(params=params, record=self.records[numbers], **shared)
 
     @property
     def scores(self) -> np.ndarray:
@@ -346,19 +342,19 @@ def _write(
     discount: float | None,
     is_set: bool,
 ) -> None:
-    must = "must be given for a potential-based RN"
     is_known = discount is not None or not env.config.needs_discount
-    require(is_known, "discount", f"{must}; got None. Set discount=params.discount.")
-    shapes = _shapes_of(env)
-    proxies = [_flatten(x) if isinstance(x, Mapping) else {} for x in weights]
-    proxies = [{name: np.asarray(x, np.float32) for name, x in flat.items()} for flat in proxies]
-    for tensors in proxies:
-        check_tensors("weights", tensors, shapes, "params.weights")
-    stacked = {name: np.stack([tensors[name] for tensors in proxies]) for name in proxies[0]}
-    known = {
-        "env": env.task.origin or {"name": env.task.name},
-        "proxy": registry.describe("proxy", env.config),
-    }
+    must = "must be given for a potential-based RN; got None. Set discount=params.discount."
+    require(is_known, "discount", must)
+    stacked: dict[str, list[np.ndarray]] = {}
+    for nested in weights:
+        flat = _flatten(nested) if isinstance(nested, Mapping) else {}
+        tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+        check_tensors("weights", tensors, _shapes_of(env), "params.weights")
+        stacked = {name: [*stacked.get(name, []), x] for name, x in tensors.items()}
+    if is_set:
+        tensors = {name: np.stack(arrays) for name, arrays in stacked.items()}
+    known = {"env": env.task.origin or {"name": env.task.name}}
+    known["proxy"] = registry.describe("proxy", env.config)
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,
@@ -370,7 +366,7 @@ def _write(
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
-        data = header.packed(stacked if is_set else proxies[0], stored)
+        data = header.packed(tensors, stored)
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         must = "must be plain values that sejax.load takes, with numbers for score and seed"
         fix = "Set config=sejax.config(...).plain()"
@@ -495,10 +491,9 @@ def _proxies_of(
 
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
-    for name, part, kind in (("task", task, Task), ("proxy", proxy, ProxyConfig)):
-        got = f"got {shortened(repr(part))}. Leave it out for a registered {name}"
-        is_kind = part is None or isinstance(part, kind)
-        require(is_kind, name, f"must be a sejax.{kind.__name__}; {got}.")
+    for name, cls, part in (("task", Task, task), ("proxy", ProxyConfig, proxy)):
+        if part is not None:
+            require_part(name, cls, part, f"Leave it out for a registered {name}.")
     learned, where = stored.header, stored.path.name
     if proxy is None:
         proxy = header.configured("proxy", learned.config["proxy"], where, option)
@@ -569,8 +564,7 @@ def _absent_task(name: str, known: str, reason: str) -> Task:
     """
     interface, origin = json.loads(known)
     spec = TaskSpec.of_interface(interface)
-    env = AbsentEnv(spec, reason)
-    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
+    return Task(name=name, env=AbsentEnv(spec, reason), max_steps=spec.max_steps, origin=origin)
 
 
 # --- gymnax ---------------------------------------------------------------------------------------

@@ -198,6 +198,10 @@ def spread(values: Sequence[float], spec: str) -> str:
 # --- model cards ----------------------------------------------------------------------------------
 
 _KINDS = {"se": ["synthetic-environment"], "rn": ["reward-network"], "other": []}  # with tags
+_ROW = (  # of an evaluation
+    "| {0.agent} | {0.hparams} | {0.world} | {0.return_mean:.1f} ± {0.return_std:.1f} | "
+    "{0.train_steps:,.0f} | {0.num_agents} |"
+)
 _BEST = {  # overrides of `sejax.evaluate` that train agents again as they were
     "default": " agent={}",
     "varied": " agent={} agent_hparams=varied",
@@ -222,15 +226,12 @@ def card_of(
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
-    values = {
+    values = vars(proxy) | {
         "front": json.dumps(license) if hub.is_address(source) else None,
         "tags": json.dumps(tags),
-        "name": proxy.name,
         **{name: "" if name == kind else None for name in _KINDS},
-        "task": proxy.task,
-        "kind": proxy.kind,
         "facts": table([{"field": name, "value": text} for name, text in _facts(proxy).items()]),
-        "evaluations": table([*map(_cells, proxy.evaluations)]) or None,
+        "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
         "command": proxy.learning and proxy.learning.command,
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
         "gym": _GYM.format(call) if kind == "se" else "",
@@ -240,15 +241,12 @@ def card_of(
         "license": license or SHIPPED_LICENSE,
     }
     parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
-    fields = [re.findall(r"\{(\w+)\}", part) for part in parts]
-    kept = [x for x, names in zip(parts, fields, strict=True) if None not in map(values.get, names)]
+    kept = [x for x in parts if None not in map(values.get, re.findall(r"\{(\w+)\}", x))]
     return "\n\n".join(kept).format(**values)
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
-    """A table in Markdown, of rows by the names of their columns; empty without rows."""
-    if not rows:
-        return ""
+    """A table in Markdown, of rows by the names of their columns."""
     lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -271,18 +269,6 @@ def _text(value: object) -> str:
     if is_number(value):
         return f"{value:,.5g}" if isinstance(value, float) else f"{value:,}"
     return "" if value is None else as_text(value)
-
-
-def _cells(evaluation: Evaluation) -> dict[str, str]:
-    """An evaluation's row in a card."""
-    return {
-        "agent": evaluation.agent,
-        "hyperparameters": evaluation.hparams,
-        "trained on": evaluation.world,
-        "return": f"{evaluation.return_mean:.1f} ± {evaluation.return_std:.1f}",
-        "training steps": f"{evaluation.train_steps:,.0f}",
-        "agents": str(evaluation.num_agents),
-    }
 
 
 # --- sharing --------------------------------------------------------------------------------------
