@@ -105,20 +105,6 @@ def test_registering_with_gymnax_is_idempotent():
         chex.assert_trees_all_equal(params, sejax.load(env_id.removeprefix("sejax/"))[1])
 
 
-@pytest.mark.parametrize("name", header.pretrained_names())
-def test_shipped_proxies_load(name):
-    proxy = sejax.load_proxy(name)
-    assert proxy.path.parent == header.PRETRAINED_DIR
-    for group in ("exploration", "es", "objective"):
-        assert proxy.learned_with(group) is not None
-    assert sejax.training_of(proxy).max_episodes > 0
-    agents = proxy.learned_agents()
-    own = agents[next(iter(agents))].discount  # of the first agent; of a policy there is none
-    assert proxy.discount == (1.0 if "policy_return" in proxy.record else own)
-    assert {"generation", "seed", "evaluations"} <= proxy.record.keys()
-    assert proxy.record.keys() & {"score", "policy_return"}
-
-
 @pytest.mark.slow
 def test_every_stored_result_loads():
     files = sorted((header.PRETRAINED_DIR.parents[1] / "results").rglob("*.safetensors"))
