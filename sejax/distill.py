@@ -185,16 +185,15 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
         lessons, costs = copied(own.copy, task, own.policy, keys)
     store.put(CHECKPOINT)
     ses = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
-    env, weights = ses[0][0], [weights for _, weights in ses]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
         student_keys = jax.random.split(keys[CHOOSE], own.num_students)
-        rows = students(env, weights, lessons, config, student_keys, store).assign(use=CHOOSE)
+        rows = students(ses, lessons, config, student_keys, store).assign(use=CHOOSE)
         marks = grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
     student_keys = jax.random.split(keys[TEST], own.num_tested)
-    tested = students(env, [weights[best]], [lessons[best]], config, student_keys, store)
+    tested = students([ses[best]], [lessons[best]], config, student_keys, store)
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
@@ -211,7 +210,7 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     generation, _, _, policy_return = lessons[best]
     record = {"generation": generation, "seed": config.seed, "policy_return": policy_return}
     record |= {"evaluations": evaluations_of(tested), "learning": learning}
-    save(path, env, weights[best], learned_with, **record)
+    save(path, *ses[best], learned_with, **record)
     write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
     print(f"{path} holds the SE of generation {generation}.")
     return path

@@ -89,18 +89,17 @@ def test_the_papers_se_for_cartpole_has_2247_parameters():
     assert sum(x.size for x in jax.tree.leaves(weights)) == 2247
 
 
-@pytest.mark.parametrize("done", [-3.0, 0.0, 0.5, 0.501, 7.0])
 @pytest.mark.parametrize("mode", ["soft", "threshold"])
-def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode, done):
-    weights = constant_heads(make_env(), state=1.0, reward=2.0, done=done)
-    obs, state, reward, terminated, info = step[mode](weights)
-    assert terminated == (done > 0.5)
-    assert (obs == 1.0).all() and (state.vector == 1.0).all()  # the predicted state itself
-    assert reward == 2.0  # the reward of the last step counts
-    # soft: 1 - d, not confined to [0, 1]; threshold: 1 - [d > 0.5].
-    expected = 1.0 - done if mode == "soft" else 1.0 - (done > 0.5)
-    np.testing.assert_allclose(info["discount"], expected, rtol=1e-6)
-    assert not info["nonfinite"]
+def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode):
+    for done in (-3.0, 0.0, 0.5, 0.501, 7.0):
+        weights = constant_heads(make_env(), state=1.0, reward=2.0, done=done)
+        obs, state, reward, terminated, info = step[mode](weights)
+        # The predicted state itself; the reward of the last step counts.
+        assert (obs == 1.0).all() and (state.vector == 1.0).all() and reward == 2.0
+        assert terminated == (done > 0.5) and not info["nonfinite"]
+        # soft: 1 - d, not confined to [0, 1]; threshold: 1 - [d > 0.5].
+        expected = 1.0 - done if mode == "soft" else 1.0 - (done > 0.5)
+        np.testing.assert_allclose(info["discount"], expected, rtol=1e-6)
 
 
 # --- outputs that no world has -------------------------------------------------------------------
@@ -342,8 +341,6 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
 
 def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
-    assert env.num_actions == 3
-    assert env.observation_space().shape == (6,)
-    assert env.name == "Synthetic-acrobot"
+    assert env.num_actions == 3 and env.observation_space().shape == (6,)
+    assert env.name == "Synthetic-acrobot" and not is_real(env) and episode_limit(env) == 500
     assert make_env("acrobot") is env  # one instance for each configuration
-    assert not is_real(env) and episode_limit(env) == 500

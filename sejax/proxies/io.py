@@ -183,7 +183,7 @@ def _stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[s
     if isinstance(proxy, ProxyEnv) and proxy.learned_config is not None:
         return proxy, proxy.learned_config
     fix = "Set env, params = sejax.load(source)"
-    raise ConfigError(f"proxy must be stored; got {type(proxy).__name__}. {fix}.", "proxy")
+    raise ConfigError(f"proxy must be a stored one; got {type(proxy).__name__}. {fix}.", "proxy")
 
 
 def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Agent:
