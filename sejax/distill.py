@@ -208,8 +208,9 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     path, plain = folder / "proxy.safetensors", configuration.plain(config)
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
     generation, _, _, policy_return = lessons[best]
-    record = {"generation": generation, "seed": config.seed, "policy_return": policy_return}
-    record |= {"evaluations": evaluations_of(tested), "learning": learning}
+    record: dict[str, Any] = {"generation": generation, "seed": config.seed}
+    record |= {"policy_return": policy_return, "evaluations": evaluations_of(tested)}
+    record["learning"] = learning
     save(path, *ses[best], learned_with, **record)
     write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
     print(f"{path} holds the SE of generation {generation}.")

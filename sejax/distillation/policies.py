@@ -133,8 +133,10 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
         agent = make_agent(registry.configure("agent", {"name": name}), task)
     except ConfigError as error:  # it does not fit the task
         raise error.moved("agent", "policy") from error
-    limits = {"max_steps": num_steps, "max_episodes": num_steps}
-    train = make_trainer(agent, task.env, TrainingConfig(time_limit_is_terminal=False, **limits))
+    training = TrainingConfig(
+        max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
+    )
+    train = make_trainer(agent, task.env, training)
     key_train, key_act = jax.random.split(key)
     print(f"training a {name} on {task.name} for {num_steps:,} steps ...", flush=True)
     state = jax.jit(train)(key_train, task.params).agent_state

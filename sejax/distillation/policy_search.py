@@ -299,7 +299,7 @@ def searched(
     Returns:
       The lessons, and a row of `COLUMNS` for each policy that was tested.
     """
-    search = Search(*map(jax.jit, make_search(options, task, devices)))
+    search = Search(*(jax.jit(function) for function in make_search(options, task, devices)))
     rows: list[Arrays] = []  # of tested policies, in their order
 
     def climb(start: int, first: int, policy: Policy) -> Arrays:

@@ -119,7 +119,7 @@ def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Plain values of a configuration's agent, or of its mixture of agents, by their keys."""
     agent, mixture = config.get("agent"), config.get("agents")
-    agents = {
+    agents: dict[str, Any] = {
         key: {name: value for name, value in values.items() if name != "weight"}
         for key, values in (mixture.items() if isinstance(mixture, Mapping) else ())
         if isinstance(values, Mapping)
