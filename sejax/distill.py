@@ -77,12 +77,10 @@ class DistillConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         num_tests = -(-self.search.generations // self.search.test_every)
-        require(
-            self.policy is not None or self.num_snapshots <= num_tests,
-            "num_snapshots",
-            f"must be at most {num_tests}, as many policies as the search tests; got "
-            f"{self.num_snapshots}. Set search.test_every=1.",
-        )
+        is_fit = self.policy is not None or self.num_snapshots <= num_tests
+        must = f"must be at most {num_tests}, the policies that the search tests"
+        got = f"got {self.num_snapshots}. Set search.test_every=1"
+        require(is_fit, "num_snapshots", f"{must}; {got}.")
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -103,13 +101,14 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    texts = dict(help_texts(DistillConfig))
-    for part in (CopyConfig, SearchConfig):
-        texts |= {f"{part.group}.{name}": text for name, text in help_texts(part).items()}
-    lines = [
-        f"  {name}={as_text(default)}" + (f"  # {texts[name]}" if name in texts else "")
-        for name, default in flatten(to_plain(fields_of(DistillConfig))).items()
-    ]
+    parts = {"": DistillConfig, "copy.": CopyConfig, "search.": SearchConfig}
+    texts = {
+        f"{prefix}{name}": f"  # {text}"
+        for prefix, part in parts.items()
+        for name, text in help_texts(part).items()
+    }
+    defaults = flatten(to_plain(fields_of(DistillConfig)))
+    lines = [f"  {name}={as_text(x)}{texts.get(name, '')}" for name, x in defaults.items()]
     return "\n".join([str(__doc__), "Its own fields, with their defaults:", *lines])
 
 
@@ -120,26 +119,25 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
       ConfigError: for overrides that cannot be.
     """
     values: dict[str, Any] = {}
-    others = []
+    others = {}
     for override in overrides:
         name, _, text = override.partition("=")
-        first, _, last = name.partition(".")
-        if first in fields_of(DistillConfig):
-            values = merge(values, {first: {last: text}} if last else {first: text})
+        group, _, field = name.partition(".")
+        if group in fields_of(DistillConfig):
+            values = merge(values, {group: {field: text} if field else text})
         else:
             fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-            require(first in TAKEN, name, f"must be left out, as it has no effect here. {fix}")
-            others.append(override)
-    task = configuration.config([word for word in others if word.startswith(("env=", "env."))])
+            require(group in TAKEN, name, f"must be left out, as it has no effect here. {fix}")
+            others[name] = override
+    task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
     kind = envs.spec_of(task.env).actions
-    given = dict(word.partition("=")[::2] for word in others)
-    steps = given.get("training.max_steps", STEPS[kind])
+    steps = others.get("training.max_steps", STEPS[kind]).rpartition("=")[2]
     # An episode of a one-step SE is a step.
-    defaults = ["preset=distilled", f"training.max_steps={steps}", f"training.max_episodes={steps}"]
-    if not given.keys() & {"agent", "agents"}:
-        defaults.append(f"agents={STUDENTS[kind]}")
-    unsaid = [word for word in defaults if word.partition("=")[0] not in given]
-    config = configuration.config([*unsaid, *others])
+    defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
+    if not others.keys() & {"agent", "agents"}:
+        defaults["agents"] = STUDENTS[kind]
+    words = {name: f"{name}={value}" for name, value in defaults.items()}
+    config = configuration.config([*(words | others).values()])
     # The task's reward for being healthy is left out of searches.
     bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
     return from_plain(DistillConfig, merge(bonus, values), ""), config
@@ -172,64 +170,34 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       OSError: if a file cannot be written.
     """
     with Store(folder, settings_of(own, config)) as store:
+        store.get(CHECKPOINT)  # which refuses a folder of another command
         return _distilled(own, config, store, words)
 
 
 def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
     task, folder = config.task(), store.folder
-    store.get(CHECKPOINT)  # which refuses a folder of another command
     uses = ("search", "nothing", "record", CHOOSE, TEST)  # policies are tested by the last one too
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if own.policy is None:
-        num_lessons = own.num_snapshots
-        lessons, costs = searched(own.search, task, num_lessons, keys, store, config.devices)
+        lessons, costs = searched(own.search, task, own.num_snapshots, keys, store, config.devices)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
         lessons, costs = copied(own.copy, task, own.policy, keys)
     store.put(CHECKPOINT)
     ses = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
-    env, weights = ses[0][0], [weights for _, weights in ses]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
-        own_keys = jax.random.split(keys[CHOOSE], own.num_students)
-        rows = students(env, weights, lessons, config, own_keys, store).assign(use=CHOOSE)
+        student_keys = jax.random.split(keys[CHOOSE], own.num_students)
+        rows = students(ses, lessons, config, student_keys, store).assign(use=CHOOSE)
         marks = grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
-    own_keys = jax.random.split(keys[TEST], own.num_tested)
-    tested = students(env, [weights[best]], [lessons[best]], config, own_keys, store)
+    student_keys = jax.random.split(keys[TEST], own.num_tested)
+    tested = students([ses[best]], [lessons[best]], config, student_keys, store)
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
-    plain = configuration.plain(config)
-    path = folder / "proxy.safetensors"
-    save(
-        path,
-        env,
-        weights[best],
-        {name: value for name, value in plain.items() if name not in ("env", "proxy")},
-        generation=lessons[best].generation,
-        seed=config.seed,
-        policy_return=lessons[best].policy_return,
-        evaluations=evaluations_of(tested),
-        learning=learning_of(own, words, costs, rows),
-    )
-    write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
-    print(f"{path} holds the SE of generation {lessons[best].generation}.")
-    return path
-
-
-def settings_of(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
-    """What the numbers depend on, as plain values."""
-    plain = configuration.plain(config)
-    return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
-
-
-def learning_of(
-    own: DistillConfig, words: str, costs: pd.DataFrame, rows: pd.DataFrame
-) -> dict[str, Any]:
-    """What the SE cost, its students included, as its file keeps it."""
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
-    return {
+    learning = {
         "command": f"python -m sejax.distill {words}".rstrip(),
         "generations": own.search.generations if own.policy is None else 0,
         "real_steps": int(spent["real_steps"]),
@@ -237,6 +205,22 @@ def learning_of(
         "train_steps": int(rows["train_steps"].sum()),
         "cpu_s": round(float(spent["cpu_s"]), 1),
     }
+    path, plain = folder / "proxy.safetensors", configuration.plain(config)
+    learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
+    generation, _, _, policy_return = lessons[best]
+    record: dict[str, Any] = {"generation": generation, "seed": config.seed}
+    record |= {"policy_return": policy_return, "evaluations": evaluations_of(tested)}
+    record["learning"] = learning
+    save(path, *ses[best], learned_with, **record)
+    write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
+    print(f"{path} holds the SE of generation {generation}.")
+    return path
+
+
+def settings_of(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+    """What the numbers depend on, as plain values."""
+    plain = configuration.plain(config)
+    return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:

@@ -1,5 +1,7 @@
 """Bandits that copy a policy: what they pay, and the policies that they copy."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pandas as pd
@@ -56,12 +58,11 @@ def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
 
 
 def test_a_search_ends_when_its_steps_are_spent():
-    task = envs.make("pendulum")  # whose episodes all have 200 steps
+    task = dataclasses.replace(envs.make("pendulum"), max_steps=9, params=None)  # of all episodes
     teacher = bandits.searched(task, real_steps=1, seed=0)
     copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
     one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS.num_directions + 1
-    assert copied.real_steps == 200 * one_generation
-    assert copied.policy_return < task.solved_reward
+    assert copied.real_steps == 9 * one_generation
 
 
 def test_a_copy_of_an_agent_has_its_greedy_actions_and_its_steps():

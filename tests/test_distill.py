@@ -20,7 +20,7 @@ QUICK = (
     *("search.num_directions=4", "search.num_top=2", "search.generations=4", "num_snapshots=2"),
     *("search.test_every=1", "search.num_tests=2", "search.num_starts=2"),
     *("search.start_generations=2", "training.max_steps=60", "training.test_episodes=2"),
-    *("copy.rounds=1", "copy.episodes=2", "copy.steps=300", "copy.hidden_size=4"),
+    *("copy.rounds=1", "copy.episodes=2", "copy.steps=300", "copy.hidden_size=0"),
 )
 POLICY = f"policy={__name__}:act"
 SIGN = 1.0  # of the policy that a test distils by its name
@@ -74,9 +74,7 @@ def test_the_se_that_teaches_best_is_written_and_says_what_it_is(folder):
     assert shown.learning.train_steps == 6 * 60
 
 
-@pytest.mark.parametrize(
-    "lost", ["search/start1-*", "search/*", "students/*", "search/start?-[23]*"]
-)
+@pytest.mark.parametrize("lost", ["search/start?-[13]*", "students/*"])
 def test_a_killed_command_goes_on_to_the_same_file(copied, folder, lost):
     for path in [*copied.glob(lost), *copied.glob("*.csv"), copied / "proxy.safetensors"]:
         path.unlink()
@@ -120,32 +118,23 @@ def test_a_function_that_has_changed_gets_students_of_its_own(tmp_path, monkeypa
 
 
 def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
-    main([*QUICK, "policy=ddqn", "copy.agent_steps=300", f"run_dir={tmp_path}"])
+    main([*QUICK, "policy=ddqn", "copy.agent_steps=200", f"run_dir={tmp_path}"])
     shown, rows = zoo.describe(header.read(tmp_path)), pd.read_csv(tmp_path / "students.csv")
-    assert shown.learning.real_steps > 300 + 2 * shown.policy_return + rows["real_steps"].sum()
+    assert shown.learning.real_steps > 200 + 2 * shown.policy_return + rows["real_steps"].sum()
 
 
 @pytest.mark.parametrize(
-    ("word", "field"),
+    "word",
     [
-        ("num_snapshots=5", "num_snapshots"),
-        ("search.num_top=5", "search.num_top"),
-        ("search.generationz=5", "search.generationz"),
-        ("agent=nothing", "agent"),
-        ("generations=5", "generations"),
-        ("proxy.hidden_size=5", "proxy.hidden_size"),
-        ("env=cliff_walking", "agent"),
-        ("policy=sax", "policy"),
-        ("policy=nothing:act", "policy"),
-        ("policy=td3", "policy"),
-        (f"policy={__name__}:SIGN", "policy"),
-        (f"policy={__name__}:of_another_shape", "policy"),
-        (f"policy={__name__}:out_of_range", "policy"),
-        (f"policy={__name__}:fails", "policy"),
+        *("num_snapshots=5", "search.num_top=5", "search.generationz=5", "agent=nothing"),
+        *("generations=5", "proxy.hidden_size=5"),
+        *("policy=sax", "policy=nothing:act", "policy=td3"),
+        *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),
     ],
 )
-def test_what_cannot_be_is_refused_and_leaves_nothing(word, field, tmp_path):
-    assert refused(main, [*QUICK, f"run_dir={tmp_path}/runs/a", word]) == field
+def test_what_cannot_be_is_refused_and_leaves_nothing(word, tmp_path):
+    field = refused(main, [*QUICK, f"run_dir={tmp_path}/runs/a", word])
+    assert field == word.partition("=")[0]
     assert not (tmp_path / "runs").exists()
 
 
@@ -171,14 +160,11 @@ def test_defaults_are_those_of_the_task():
     assert config.training.max_episodes == 700 and list(config.scored_agents) == ["ddqn", "ppo"]
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        ([], "distill-cartpole-s0"),
-        (["policy=ppo"], "distill-cartpole-ppo-s0"),
-        (["policy=ppo:a/model.zip"], "distill-cartpole-ppo-model-s0"),
-        (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
-    ],
-)
+@pytest.mark.parametrize(("words", "name"), [
+    ([], "distill-cartpole-s0"),
+    (["policy=ppo"], "distill-cartpole-ppo-s0"),
+    (["policy=ppo:a/model.zip"], "distill-cartpole-ppo-model-s0"),
+    (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
+])  # fmt: skip
 def test_the_default_folder_tells_policies_apart(words, name):
     assert folder_of(*read(["env=cartpole", *words])).name == name

@@ -13,6 +13,8 @@ from support import paper_se, refusal, refused
 
 import sejax
 from sejax.proxies import header, hub
+from sejax.runs.config import evaluate_config
+from sejax.runs.worlds import proxy_setup
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
 
@@ -124,8 +126,8 @@ def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
 def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, tmp_path):
     env, params = sejax.load("pendulum")
     config = {"agents": {"sac": {"name": "sac"}}}
-    sejax.save(tmp_path / "proxy.safetensors", env, params.weights, config, score=-150.0,
-               generation=7, seed=2)  # fmt: skip
+    record = {"score": -150.0, "generation": 7, "seed": 2}
+    sejax.save(tmp_path / "proxy.safetensors", env, params.weights, config, **record)
     sejax.push(tmp_path, "me/swing-up", license="mit")
     front, card = front_and_card(the_hub, "me/swing-up")
     assert front == {
@@ -157,12 +159,10 @@ def front_and_card(the_hub, repo):
 
 
 def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
-    task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, solved_reward=1.0,
-                      max_steps=10)  # fmt: skip
+    task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, max_steps=10)
     env = paper_se(hidden_size=2).make(task)
-    path = tmp_path / "mine.safetensors"
-    sejax.save(path, env, env.init_weights(jax.random.key(0)))
-    address = sejax.push(path, "me/mine")
+    sejax.save(tmp_path / "mine.safetensors", env, env.init_weights(jax.random.key(0)))
+    address = sejax.push(tmp_path / "mine.safetensors", "me/mine")
     _, card = front_and_card(the_hub, "me/mine")
     assert 'sejax.load("hf://me/mine", task=...)' in card and "env=..." in card
     assert sejax.load(address, task=task)[0].task is task
@@ -201,9 +201,6 @@ def test_what_cannot_be_read_or_written_is_one_message(the_hub, monkeypatch):
 
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
-    from sejax.runs import config as configuration
-    from sejax.runs.worlds import proxy_setup
-
     sejax.push("cartpole", "me/se")
-    study = proxy_setup(configuration.evaluate_config(["proxy=hf://me/se@0"]))
+    study = proxy_setup(evaluate_config(["proxy=hf://me/se@0"]))
     assert study.task.name == "cartpole" and str(study.out_dir) == "runs/evaluate-me_se_0"

@@ -18,6 +18,7 @@ import sejax
 from sejax import envs
 from sejax.distill import read
 from sejax.gym import GYMNASIUM_IDS, make
+from sejax.options import registry
 from sejax.proxies import header, zoo
 from sejax.runs.config import evaluate_config
 from sejax.runs.worlds import proxy_setup
@@ -38,33 +39,25 @@ def test_they_are_listed_as_a_table():
     assert len({row.index(f" {PROXIES[row.split()[0]].kind} ") for row in rows}) == 1, "a column"
 
 
-@pytest.mark.parametrize("name", PROXIES)
-def test_each_has_a_card_that_says_what_it_teaches(name):
-    proxy = PROXIES[name]
+@pytest.mark.parametrize("proxy", PROXIES.values(), ids=list(PROXIES))
+def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
+    learning, name = proxy.learning, proxy.name
     assert proxy.is_distilled or proxy.agents
     assert all(map(math.isfinite, proxy.scores.values()))
-    assert proxy.on_proxy and all(each.num_agents >= 10 for each in proxy.on_proxy)
-    assert proxy.card.startswith(f"# {name}\n")
-    for said in (f"`{proxy.task}`", f'sejax.load("{name}")', "Apache-2.0"):
-        assert said in proxy.card
-    for each in proxy.evaluations:
-        assert f"{each.return_mean:.1f} ± {each.return_std:.1f}" in proxy.card
-    (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    study = proxy_setup(evaluate_config(words.split()))
-    best = max(proxy.on_proxy, key=lambda each: each.return_mean)
-    assert best.agent in study.worlds["the proxy"][2], "the command trains what did best"
-
-
-@pytest.mark.parametrize("name", PROXIES)
-def test_each_says_what_it_cost(name):
-    proxy = PROXIES[name]
-    learning = proxy.learning
-    for number in (learning.generations, learning.real_steps):
-        assert number > 0 and f"{number:,}" in proxy.card
-    assert learning.command in proxy.card
+    assert proxy.on_proxy and all(x.num_agents >= 10 for x in proxy.on_proxy)
+    counts = [learning.generations, learning.real_steps]
+    said = [f"`{proxy.task}`", f'sejax.load("{name}")', "Apache-2.0", learning.command]
+    said += [f"{x.return_mean:.1f} ± {x.return_std:.1f}" for x in proxy.evaluations]
+    said += [f"{count:,}" for count in counts]
+    assert proxy.card.startswith(f"# {name}\n") and all(text in proxy.card for text in said)
+    assert min(counts) > 0
     if proxy.kind == "se":
         assert learning.cpu_s > 0 and learning.train_steps > learning.agents
         assert learning.generations >= proxy.generation
+    (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
+    study = proxy_setup(evaluate_config(words.split()))
+    best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean)
+    assert best.agent in study.worlds["the proxy"].trainings, "the command trains what did best"
 
 
 @pytest.mark.parametrize("name", PROXIES)
@@ -79,8 +72,11 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     else:
         config = sejax.config(words)
         assert config.generations == proxy.learning.generations
-    fields = {field: value for field, value in stored.config["env"].items() if field != "name"}
-    assert config.env == type(config.env)(**fields)
+    assert config.env == registry.configure("env", stored.config["env"])
+    agents = stored.learned_agents()
+    first = agents[next(iter(agents))].discount  # of a policy there is none
+    assert stored.discount == (1.0 if proxy.is_distilled else first)
+    assert all(stored.learned_with(group) for group in ("exploration", "es", "objective"))
     if proxy.kind == "se":
         assert config.training == sejax.training_of(stored)
     if proxy.kind == "se" and not proxy.is_distilled:
@@ -100,13 +96,14 @@ def test_the_page_is_what_the_tool_makes():
 
 def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
     """If it was tested, with the weights that are shipped: those of a bandit are a policy's."""
-    cells = {name: make_zoo.row(PROXIES[name], make_zoo.verdicts())["teaches by"]
-             for name in PROXIES}  # fmt: skip
-    for name, proxy in PROXIES.items():
-        if proxy.kind == "rn":
-            assert cells[name] == ""
-        elif proxy.settings["horizon"] == 1:
-            assert cells[name] in ("policy", "")
+    verdicts = make_zoo.verdicts()
+    for proxy in PROXIES.values():
+        cell = make_zoo.row(proxy, verdicts)["teaches by"]
+        assert (
+            cell == ""
+            or (proxy.kind == "se" and proxy.settings["horizon"] != 1)
+            or cell == "policy"
+        )
     folder = tmp_path / "results" / "se_myopia" / "cartpole"
     folder.mkdir(parents=True)
     monkeypatch.setattr(make_zoo, "ROOT", tmp_path)

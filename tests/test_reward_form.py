@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import numpy_forward, refused
 
 import sejax
 from sejax import envs
-from sejax.options import ConfigError
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import config as configuration
 
@@ -39,10 +39,7 @@ def test_the_reward_is_what_the_form_says(form):
     env, weights = made(FORMS[form])
     # The network by hand: leaky ReLUs of the state in units of half the way to the bounds.
     seen = np.asarray(OBS) / np.array([0.5, 0.5, 4.0])
-    first, last = weights["reward"]["Dense_0"], weights["reward"]["Dense_1"]
-    hidden = np.asarray(first["kernel"]) @ seen + np.asarray(first["bias"])
-    hidden = np.where(hidden > 0, hidden, 0.01 * hidden)
-    output = np.asarray(last["kernel"]) @ hidden + np.asarray(last["bias"])
+    output = numpy_forward(weights["reward"], seen, "leaky_relu", 1)
     best = 2.0 * np.clip(output, -1, 1)
     for action in (-2.0, 0.3, 5.0):  # the last is clipped to 2
         apart = abs(min(action, 2.0) - best[0])
@@ -62,15 +59,10 @@ def test_it_is_stored_and_plays_in_numpy_alike(tmp_path):
         np.testing.assert_allclose(reward, env.bandit_reward(weights, obs, action), rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("words", "field"),
-    [
-        (["env=cartpole", "proxy.reward_form=distance", "proxy.horizon=1"], "proxy.reward_form"),
-        (["env=pendulum", "proxy.reward_form=distance", "proxy.horizon=null"], "proxy.reward_form"),
-        (["env=cartpole", "proxy.reward_slope=2"], "proxy.reward_slope"),
-    ],
-)
-def test_a_form_that_cannot_be_is_refused(words, field):
-    with pytest.raises(ConfigError) as error:
-        configuration.config(words)
-    assert error.value.field == field
+@pytest.mark.parametrize("words", [
+    ["proxy.reward_form=distance", "env=cartpole", "proxy.horizon=1"],
+    ["proxy.reward_form=distance", "env=pendulum", "proxy.horizon=null"],
+    ["proxy.reward_slope=2", "env=cartpole"],
+])  # fmt: skip
+def test_a_form_that_cannot_be_is_refused(words):
+    assert refused(configuration.config, words) == words[0].partition("=")[0]

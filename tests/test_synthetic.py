@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward, paper_se
+from support import assert_close, bits, numpy_forward, paper_se, refused
 
 from sejax import envs
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
-from sejax.proxies.synthetic import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig, SyntheticState
 
 CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])
@@ -23,17 +23,19 @@ def make_env(task="cartpole", **changes):
     return registry.make("proxy", config, envs.make(task))
 
 
+DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
+
+
 @pytest.fixture(scope="module")
 def step():
     """Jitted `step_env` from OBS at time 0 with action 1, by done mode: `(weights)`."""
 
     def build(done):
         env = make_env(done=done)
-        _, state = env.reset_env(jax.random.key(0), env.default_params)
-        state = state.replace(vector=OBS)
+        state = SyntheticState(vector=OBS, time=jnp.int32(0))
         return jax.jit(lambda w: env.step_env(jax.random.key(1), state, 1, env.params(w)))
 
-    return {done: build(done) for done in ("soft", "threshold", "bernoulli", "sigmoid")}
+    return {done: build(done) for done in DONE_MODES}
 
 
 def constant_heads(env, **values):
@@ -46,17 +48,20 @@ def constant_heads(env, **values):
     return weights
 
 
+def networks_of(env, weights, inputs, *names):
+    """What the networks make of inputs `[in]`, unit by unit."""
+    return [numpy_forward(weights[name], inputs, CONFIG.activation, CONFIG.num_layers)
+            for name in names]  # fmt: skip
+
+
 @pytest.mark.parametrize("config", [{}, {"horizon": 1, "initial_state": "learned"}])
 def test_continuous_actions_are_clipped_to_the_tasks_bounds(config):
     env = make_env("pendulum", **config)
     params = env.params(env.init_weights(jax.random.key(2)))
     _, state = env.reset_env(jax.random.key(0), params)
-
-    def seen(action):
-        obs, _, reward, *_ = env.step_env(jax.random.key(1), state, jnp.array([action]), params)
-        return [*map(float, obs), float(reward)]
-
-    assert seen(50.0) == seen(2.0) != seen(1.9) and seen(-3.0) == seen(-2.0)
+    step = jax.jit(lambda action: env.step_env(jax.random.key(1), state, action, params)[:3])
+    far, high, inner, low, least = (bits(step(jnp.float32([x]))) for x in (50, 2, 1.9, -3, -2))
+    assert far == high != inner and low == least
 
 
 # --- equations -----------------------------------------------------------------------------------
@@ -70,16 +75,10 @@ def test_predict_equals_three_separate_mlps_fed_the_one_hot_action_first(task):
     predict = jax.jit(env.predict)
     for action in range(num_actions):
         obs = np.random.default_rng(action).normal(size=obs_dim)
-        one_hot = [1.0 if i == action else 0.0 for i in range(num_actions)]
-        x = np.concatenate([one_hot, obs])  # action first
-        expected = {
-            head: numpy_forward(weights[head], x, CONFIG.activation, CONFIG.num_layers)
-            for head in ("state", "reward", "done")
-        }
-        next_obs, reward, done = predict(weights, jnp.float32(obs), jnp.int32(action))
-        np.testing.assert_allclose(next_obs, expected["state"], rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(reward, expected["reward"][0], rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(done, expected["done"][0], rtol=1e-5, atol=1e-6)
+        inputs = np.concatenate([np.eye(num_actions)[action], obs])  # action first
+        state, reward, done = networks_of(env, weights, inputs, "state", "reward", "done")
+        outputs = predict(weights, jnp.float32(obs), jnp.int32(action))
+        assert_close(outputs, (state, reward[0], done[0]), rtol=1e-5, atol=1e-6)
 
 
 def test_the_papers_se_for_cartpole_has_2247_parameters():
@@ -90,46 +89,40 @@ def test_the_papers_se_for_cartpole_has_2247_parameters():
     assert sum(x.size for x in jax.tree.leaves(weights)) == 2247
 
 
-@pytest.mark.parametrize(
-    ("done", "terminates"), [(-3.0, False), (0.0, False), (0.5, False), (0.501, True), (7.0, True)]
-)
 @pytest.mark.parametrize("mode", ["soft", "threshold"])
-def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode, done, terminates):
-    obs, state, reward, terminated, info = step[mode](
-        constant_heads(make_env(), state=1.0, reward=2.0, done=done)
-    )
-    assert terminated == terminates
-    assert (obs == 1.0).all() and (state.vector == 1.0).all()  # the predicted state itself
-    assert reward == 2.0  # the reward of the last step counts
-    # soft: 1 - d, not confined to [0, 1]; threshold: 1 - [d > 0.5].
-    expected = 1.0 - done if mode == "soft" else 1.0 - terminates
-    np.testing.assert_allclose(info["discount"], expected, rtol=1e-6)
-    assert not info["nonfinite"]
+def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode):
+    for done in (-3.0, 0.0, 0.5, 0.501, 7.0):
+        weights = constant_heads(make_env(), state=1.0, reward=2.0, done=done)
+        obs, state, reward, terminated, info = step[mode](weights)
+        # The predicted state itself; the reward of the last step counts.
+        assert (obs == 1.0).all() and (state.vector == 1.0).all() and reward == 2.0
+        assert terminated == (done > 0.5) and not info["nonfinite"]
+        # soft: 1 - d, not confined to [0, 1]; threshold: 1 - [d > 0.5].
+        expected = 1.0 - done if mode == "soft" else 1.0 - (done > 0.5)
+        np.testing.assert_allclose(info["discount"], expected, rtol=1e-6)
 
 
 # --- outputs that no world has -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "outputs",
-    [
-        {"state": np.nan}, {"state": np.inf}, {"reward": np.nan}, {"reward": -np.inf},
-        {"done": np.nan}, {"done": -np.inf},
-        {"state": 2 * MAX_ABS_VALUE}, {"reward": -2 * MAX_ABS_VALUE}, {"done": -2 * MAX_ABS_VALUE},
-    ],
-    ids=str,
-)  # fmt: skip
-@pytest.mark.parametrize("mode", ["soft", "threshold", "bernoulli", "sigmoid"])
-def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode, outputs):
-    weights = constant_heads(make_env(), **{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs})
-    obs, state, reward, terminated, info = step[mode](weights)
-    np.testing.assert_array_equal(obs, OBS)
-    np.testing.assert_array_equal(state.vector, OBS)
-    assert terminated
-    assert reward == 0.0
-    assert info["discount"] == 0.0
-    (value,) = outputs.values()
-    assert info["nonfinite"] == (not np.isfinite(value))
+ABSURD = [
+    *({"state": np.nan}, {"state": np.inf}, {"reward": np.nan}, {"reward": -np.inf}),
+    *({"done": np.nan}, {"done": -np.inf}, {"state": 2 * MAX_ABS_VALUE}),
+    *({"reward": -2 * MAX_ABS_VALUE}, {"done": -2 * MAX_ABS_VALUE}),
+]
+
+
+@pytest.mark.parametrize("mode", DONE_MODES)
+def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode):
+    for outputs in ABSURD:
+        weights = constant_heads(
+            make_env(), **{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs}
+        )
+        obs, state, reward, terminated, info = step[mode](weights)
+        np.testing.assert_array_equal([obs, state.vector], [OBS, OBS])
+        assert terminated and reward == 0.0 and info["discount"] == 0.0
+        (value,) = outputs.values()
+        assert info["nonfinite"] == (not np.isfinite(value))
 
 
 def test_outputs_just_below_absurd_are_a_world(step):
@@ -168,14 +161,12 @@ def test_an_agent_sees_a_drawn_end_as_it_sees_any_other(mode, done):
     params = env.params(constant_heads(env, state=0.7, reward=1.5, done=done))
     _, state = env.reset_env(jax.random.key(0), params)
     step = jax.jit(jax.vmap(env.step_env, (0, None, None, None)))
-    obs, _, reward, terminated, info = step(
-        jax.random.split(jax.random.key(1), 50), state, 1, params
-    )
-    assert 0 < np.sum(terminated) < 50
+    keys = jax.random.split(jax.random.key(1), 50)
+    obs, _, reward, terminated, info = step(keys, state, 1, params)
+    assert 0 < np.sum(terminated) < 50 and not info["nonfinite"].any()
     np.testing.assert_array_equal(info["discount"], 1.0 - terminated)
     np.testing.assert_allclose(obs, 0.7)  # the state after an end is the predicted one
     np.testing.assert_array_equal(reward, 1.5)
-    assert not info["nonfinite"].any()
 
 
 # --- learned beginnings --------------------------------------------------------------------------
@@ -215,10 +206,8 @@ def test_units_of_bounds_are_from_the_middle_with_half_of_the_way_as_one():
     obs, weights = np.array([0.2, -0.05]), env.init_weights(jax.random.key(3))
     seen = np.concatenate([[0, 1, 0], (obs - middle) / one])
     state, reward, _ = env.predict(weights, jnp.float32(obs), jnp.int32(1))
-    change, paid = (numpy_forward(weights[head], seen, CONFIG.activation, CONFIG.num_layers)
-                    for head in ("state", "reward"))  # fmt: skip
-    np.testing.assert_allclose(state, middle + one * change, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(reward, paid[0], rtol=1e-5, atol=1e-6)
+    change, paid = networks_of(env, weights, seen, "state", "reward")
+    assert_close((state, reward), (middle + one * change, paid[0]), rtol=1e-5, atol=1e-6)
 
 
 def test_no_two_networks_begin_with_the_same_numbers():
@@ -235,9 +224,8 @@ def test_a_discrete_task_goes_on_from_the_vector_and_not_from_what_is_seen():
     params = env.params(env.init_weights(jax.random.key(2)))
     _, state = env.reset_env(jax.random.key(0), params)
     obs, after, *_ = env.step_env(jax.random.key(1), state, 3, params)
-    one_hot = [0.0, 0.0, 0.0, 1.0]
-    x = np.concatenate([one_hot, state.vector])
-    expected = numpy_forward(params.weights["state"], x, CONFIG.activation, CONFIG.num_layers)
+    inputs = np.concatenate([[0.0, 0.0, 0.0, 1.0], state.vector])
+    (expected,) = networks_of(env, params.weights, inputs, "state")
     np.testing.assert_allclose(after.vector, expected, rtol=1e-4, atol=1e-6)
     assert obs == np.argmax(after.vector) and env.observation_space().contains(obs)
 
@@ -304,36 +292,28 @@ def test_horizons_and_least_numbers_of_steps(config, outputs, terminated, trunca
     assert env.default_params.max_steps_in_episode == limit
 
 
-@pytest.mark.parametrize("done", ["soft", "threshold", "bernoulli", "sigmoid"])
-def test_a_bandit_has_a_reward_and_nothing_else(done):
-    env = make_env(done=done, horizon=1)
+def test_a_bandit_has_a_reward_and_nothing_else():
+    env = make_env(horizon=1)
     weights = env.init_weights(jax.random.key(4))
-    assert set(weights) == {"reward"}
+    assert set(weights) == {"reward"} and episode_limit(env) == 1
     params = env.params(weights)
     start, state = env.reset_env(jax.random.key(0), params)
     real, _ = env.task.env.reset_env(jax.random.key(0), env.task.params)
-    np.testing.assert_array_equal(start, real)
-    obs, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 1, params)
-    np.testing.assert_array_equal(obs, start)
-    x = np.concatenate([[0.0, 1.0], start])
-    expected = numpy_forward(weights["reward"], x, CONFIG.activation, CONFIG.num_layers)
-    np.testing.assert_allclose(reward, expected[0], rtol=1e-5)
-    assert terminated and info["discount"] == 0.0 and not info["nonfinite"]
-    assert episode_limit(env) == 1
+    (expected,) = networks_of(env, weights, np.concatenate([[0.0, 1.0], start]), "reward")
+    for done in DONE_MODES:
+        step = make_env(horizon=1, done=done).step_env
+        obs, _, reward, terminated, info = step(jax.random.key(1), state, 1, params)
+        np.testing.assert_array_equal([obs, start], [real, real])
+        np.testing.assert_allclose(reward, expected[0], rtol=1e-5)
+        assert terminated and info["discount"] == 0.0 and not info["nonfinite"]
 
 
-@pytest.mark.parametrize(("fields", "at_fault"), [
-    ({"done": "maybe"}, "done"),
-    ({"initial_state": "any"}, "initial_state"),
-    ({"horizon": 0}, "horizon"),
-    ({"horizon": 1, "horizon_is_terminal": False}, "horizon_is_terminal"),
-    ({"min_steps": 0}, "min_steps"),
-    ({"horizon": 3, "min_steps": 4}, "min_steps"),
+@pytest.mark.parametrize("fields", [
+    {"done": "maybe"}, {"initial_state": "any"}, {"horizon": 0}, {"min_steps": 0},
+    {"horizon_is_terminal": False, "horizon": 1}, {"min_steps": 4, "horizon": 3},
 ])  # fmt: skip
-def test_what_no_episode_can_be_is_refused(fields, at_fault):
-    with pytest.raises(ConfigError) as error:
-        paper_se(**fields)
-    assert error.value.field == f"proxy.{at_fault}"
+def test_what_no_episode_can_be_is_refused(fields):
+    assert refused(paper_se, **fields) == f"proxy.{next(iter(fields))}"
 
 
 # --- as a gymnax environment ---------------------------------------------------------------------
@@ -361,8 +341,6 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
 
 def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
-    assert env.num_actions == 3
-    assert env.observation_space().shape == (6,)
-    assert env.name == "Synthetic-acrobot"
+    assert env.num_actions == 3 and env.observation_space().shape == (6,)
+    assert env.name == "Synthetic-acrobot" and not is_real(env) and episode_limit(env) == 500
     assert make_env("acrobot") is env  # one instance for each configuration
-    assert not is_real(env) and episode_limit(env) == 500

@@ -79,11 +79,8 @@ class Claims:
         if rows.startswith("settings "):
             return sejax.config(rows.split()[1:])
         if rows == "pretrained":
-            return pd.DataFrame(
-                vars(proxy) | vars(proxy.learning) | vars(each)
-                for proxy in zoo.pretrained()
-                for each in proxy.evaluations
-            )
+            pairs = [(proxy, x) for proxy in zoo.pretrained() for x in proxy.evaluations]
+            return pd.DataFrame(vars(x) | vars(x.learning) | vars(y) for x, y in pairs)
         if "*" in rows:
             found = sorted(self.root.glob(rows))
             return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
@@ -140,13 +137,9 @@ class Claims:
 
     def with_tables(self, text: str) -> str:
         """A document whose tables are what the rows give."""
-        return TABLE.sub(
-            lambda found: "\n".join([found[1], *self.lines(found[2]), "", found[3]]), text
-        )
+        return TABLE.sub(lambda x: "\n".join([x[1], *self.lines(x[2]), "", x[3]]), text)
 
-    def text_of(
-        self, entry: Mapping[str, Any], names: Mapping[str, Any]
-    ) -> tuple[re.Pattern[str], list[str]]:
+    def text_of(self, entry: Any, names: Mapping[str, Any]) -> tuple[re.Pattern[str], list[str]]:
         """An entry's text with any numbers, over any line breaks, and the numbers of its rows.
 
         Every second group of the pattern is a number; the others are the text between.
@@ -202,8 +195,8 @@ class Claims:
     def typed(self) -> dict[str, str]:
         """What the texts of claims and the cells of tables say beside their placeholders."""
         texts = {key: entry["text"] for key, entry in self.entries.get("claims", {}).items()}
-        tables = self.entries.get("tables", {}).items()
-        for key, table in ((key, table) for key, table in tables if "source" not in table):
+        tables = {k: x for k, x in self.entries.get("tables", {}).items() if "source" not in x}
+        for key, table in tables.items():
             texts[key] = "\n".join([table["head"], *(line["cells"] for line in table["lines"])])
         return {key: re.sub(r"\{.*?\}", "_", text) for key, text in texts.items()}
 

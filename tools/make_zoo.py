@@ -34,17 +34,17 @@ def verdicts() -> dict[str, str]:
     Not of a proxy that was learned anew since.
     """
     names = {f"{proxy.name} (shipped)": proxy.name for proxy in sejax.pretrained()}
-    found = {}
+    said = {}
     for folder in ROOT.glob("results/se_myopia/*"):
         rows = pd.read_csv(folder / "rows.csv.xz", low_memory=False)
-        tested = rows[rows["set"].isin(names)]
         lines = (folder / "table.md").read_text(encoding="utf-8").splitlines()
         cells = [line.strip("| ").split(" | ") for line in lines]
-        verdicts = {each[0]: each[-1] for each in cells}
+        verdicts = {line[0]: line[-1] for line in cells}
+        tested = rows[rows["set"].isin(names)].drop_duplicates(["set", "group"])
         for key, fingerprint in zip(tested["set"], tested["group"], strict=True):
             if sejax.load_proxy(names[key]).fingerprint == fingerprint:
-                found[names[key]] = verdicts[key]
-    return found
+                said[names[key]] = verdicts[key]
+    return said
 
 
 def row(proxy: sejax.PretrainedProxy, verdicts: Mapping[str, str]) -> dict[str, str]:
@@ -57,15 +57,14 @@ def row(proxy: sejax.PretrainedProxy, verdicts: Mapping[str, str]) -> dict[str, 
 
 def section(proxy: sejax.PretrainedProxy) -> str:
     """What a card says of this proxy alone: its facts, what it teaches and how it was learned."""
-    title, *sections = re.split(r"\n\n(?=## )", proxy.card)
-    bodies = dict(text.split("\n\n", 1) for text in sections)
-    name, _, facts = title.split("\n\n", 2)
-    kept = [f"#{name}", facts]
-    if "## What it teaches" in bodies:
-        kept.append(bodies["## What it teaches"].partition("\n\n")[2])
-    if "## How it was learned" in bodies:
-        kept.append(f"Learned by:\n\n{bodies['## How it was learned']}")
-    return "\n\n".join(kept)
+    card = proxy.card
+    facts = re.findall(r"^\| field .*?(?=\n\n|\Z)", card, re.DOTALL | re.MULTILINE)
+    taught = re.findall(r"^Fresh agents.*?(?=\n\n## )", card, re.DOTALL | re.MULTILINE)
+    command = re.findall(r"(?<=## How it was learned\n\n).*", card)
+    tables = [text.partition("\n\n")[2] for text in taught]
+    return "\n\n".join(
+        [f"## {proxy.name}", *facts, *tables, *(f"Learned by:\n\n{x}" for x in command)]
+    )
 
 
 if __name__ == "__main__":

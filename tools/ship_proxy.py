@@ -12,6 +12,7 @@ a set of `experiments/` tell the real steps; a bare file tells nothing. Writes
 
 import argparse
 import dataclasses
+import itertools
 import json
 import shlex
 import subprocess
@@ -42,17 +43,15 @@ def main() -> None:
     parser.add_argument("--hparams", default="default", help="of default,varied,as_learned")
     parser.add_argument("--out", type=Path, default=header.PRETRAINED_DIR, help="folder; sejax's")
     args = parser.parse_intermixed_args()  # overrides may come after options
-    path, _, place = args.run.partition("#")
-    proxy = sejax.load_set(path, option="run")[int(place or 0)]
+    path, _, number = args.run.partition("#")
+    proxy = sejax.load_set(path, option="run")[int(number or 0)]
     more = learning_of(Path(path), proxy)
     with tempfile.TemporaryDirectory() as folder:
         alone = Path(folder) / f"{args.name}.safetensors"
         save(alone, proxy)
-        more["evaluations"] = [
-            each for hparams in args.hparams.split(",") for each in evaluate(alone, hparams, args)
-        ]
+        evaluated = [evaluate(alone, hparams, args) for hparams in args.hparams.split(",")]
     target = args.out / f"{args.name}.safetensors"
-    save(target, proxy, **more)
+    save(target, proxy, **more, evaluations=[*itertools.chain(*evaluated)])
     shipped = zoo.describe(header.read(target))
     print(f"{shipped.card}\n{zoo.Zoo([shipped])}\n\n{target}")
 
@@ -77,12 +76,10 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
         costs = {name: ended[name] for name in COSTS}
     elif curves.exists():
         learned = configuration.learn_config(proxy.config)  # with the names of today
-        own = {"seed": proxy.record["seed"], "num_seeds": 1}
-        config = json.loads(json.dumps(configuration.plain(learned))) | own
-        rows = pd.read_csv(curves)
-        is_mine = (rows["variant"] == path.stem) & (rows["seed"] == config["seed"])
-        real_steps = rows[is_mine]["env_steps_total"]
-        costs = {"generations": len(real_steps), "real_steps": int(real_steps.max())}
+        config = json.loads(json.dumps(configuration.plain(learned)))
+        config |= {"seed": proxy.record["seed"], "num_seeds": 1}
+        rows = pd.read_csv(curves).query("variant == @path.stem and seed == @config['seed']")
+        costs = {"generations": len(rows), "real_steps": int(rows["env_steps_total"].max())}
     else:
         return {}
     command = f"python -m sejax.run {shlex.join(words_of(config))}"
@@ -111,11 +108,10 @@ def differing(words: list[str], config: Mapping[str, Any]) -> list[str]:
         composed = flatten(json.loads(json.dumps(configuration.plain(sejax.config(words)))))
     except sejax.ConfigError as error:  # without the word that a field belongs to
         return [str(error)]
-    return [
-        f"{name}={value if isinstance(value, str) else json.dumps(value, separators=(',', ':'))}"
-        for name, value in flatten(config).items()
-        if composed.get(name) != value and name not in FREE_FIELDS
-    ]
+    texts = {name: x if isinstance(x, str) else json.dumps(x, separators=(",", ":"))
+             for name, x in flatten(config).items()
+             if composed.get(name) != x and name not in FREE_FIELDS}  # fmt: skip
+    return [f"{name}={text}" for name, text in texts.items()]
 
 
 # --- what it teaches ------------------------------------------------------------------------------
@@ -127,28 +123,16 @@ def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[st
     choice = [f"agents=[{args.agents}]" if "," in args.agents else f"agent={args.agents}"]
     if hparams == "as_learned":
         agents, choice = list(sejax.load_proxy(path).learned_agents()), []
-    words = [
-        f"proxy={path}",
-        "num_agents=20",
-        f"agent_hparams={hparams}",
-        "baseline=false",
-        f"out_dir={path.parent}",
-        *choice,
-        *args.overrides,
-    ]
+    words = [f"proxy={path}", "num_agents=20", f"agent_hparams={hparams}", "baseline=false"]
+    words += [f"out_dir={path.parent}", *choice, *args.overrides]
     subprocess.run([sys.executable, "-m", "sejax.evaluate", *words], check=True)
-    summary = json.loads((path.parent / "evaluation.json").read_text())
+    worlds = {"the proxy": "proxy", "the real task": "real"}
+    columns = {"return_mean": "test_return_mean", "return_std": "test_return_std"}
+    columns |= {"num_agents": "num_agents", "train_steps": "train_steps_mean"}
     return [
-        {
-            "agent": agent,
-            "hparams": hparams,
-            "world": "proxy" if world == "the proxy" else "real",
-            "num_agents": row["num_agents"],
-            "return_mean": row["test_return_mean"],
-            "return_std": row["test_return_std"],
-            "train_steps": row["train_steps_mean"],
-        }
-        for world, rows in summary.items()
+        {"agent": agent, "hparams": hparams, "world": worlds[world]}
+        | {name: row[column] for name, column in columns.items()}
+        for world, rows in json.loads((path.parent / "evaluation.json").read_text()).items()
         for agent, row in (rows if len(agents) > 1 else {agents[0]: rows}).items()
     ]
 

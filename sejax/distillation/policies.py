@@ -11,6 +11,7 @@ online learning" (DAgger, 2011). The emulated error is ours.
 """
 
 import functools
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pandas as pd
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from sejax.agents import make_agent
 from sejax.distillation.policy_search import Lesson, random_map
@@ -75,10 +76,10 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
       ConfigError: for anything else; where the policy is called, if it fails, or its actions are
         none of the task.
     """
-    if text.endswith(".zip"):
-        return _checked(_of_sb3(text, task), task)
     if is_agent(text):
         return _of_agent(text, task, agent_steps, key)
+    if text.endswith(".zip"):
+        return _checked(_of_sb3(text, task), task)
     require(":" in text, "policy", f"must be a model or a function; got {shortened(text)}. {FIX}")
     registry.require_path("policy", text)
     return _checked(registry.imported("policy", text), task)
@@ -92,23 +93,19 @@ def is_agent(text: str) -> bool:
 def _checked(act: Actor, task: Task) -> Actor:
     """The policy, whose actions are looked at."""
     count = task.num_actions
+    must = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
 
     def checked(obs: np.ndarray) -> np.ndarray:
-        shape = (len(obs),) if count is not None else (len(obs), task.action_dim)
+        shape = (len(obs), *(() if count is not None else (task.action_dim,)))
         try:
             actions = np.asarray(act(obs), float)
         except Exception as error:
-            raise ConfigError(
-                f"policy must act in {task.name}; it raised {told(error)}.", "policy"
-            ) from error
-        kind = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
+            message = f"policy must act in {task.name}; it raised {told(error)}."
+            raise ConfigError(message, "policy") from error
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
-        require(
-            actions.shape == shape and known.all(),
-            "policy",
-            f"must give {kind} of the shape {list(shape)}; got {list(actions.shape)}, such as "
-            f"{shortened(actions.ravel()[:3], 40)}. Set another policy.",
-        )
+        got = f"got {list(actions.shape)}, such as {shortened(actions.ravel()[:3], 40)}"
+        is_fit = actions.shape == shape and known.all()
+        require(is_fit, "policy", f"must give {must} of the shape {list(shape)}; {got}.")
         return actions
 
     return checked
@@ -121,15 +118,12 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # whatever lacks where another algorithm looks for it
-        raise ConfigError(
-            f"policy must be a model that its algorithm saved; got {shortened(text)} "
-            f"({told(error)}). Set policy=ppo:FILE.zip; it needs pip install 'sejax[sb3]'.",
-            "policy",
-        ) from error
-    if task.num_actions is not None:
-        return lambda obs: model.predict(obs, deterministic=True)[0]
+        got = f"got {shortened(text)} ({told(error)}). It needs pip install 'sejax[sb3]'"
+        message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
+        raise ConfigError(message, "policy") from error
     # A task whose bounds are not alike everywhere is scaled to [-1, 1].
-    factor = task.max_action / np.asarray(model.action_space.high, float)
+    is_discrete = task.num_actions is not None
+    factor = 1 if is_discrete else task.max_action / np.asarray(model.action_space.high, float)
     return lambda obs: model.predict(obs, deterministic=True)[0] * factor
 
 
@@ -138,18 +132,16 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     try:
         agent = make_agent(registry.configure("agent", {"name": name}), task)
     except ConfigError as error:  # it does not fit the task
-        raise ConfigError(str(error).replace("agent", "policy"), "policy") from error
+        raise error.moved("agent", "policy") from error
     training = TrainingConfig(
         max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
     )
+    train = make_trainer(agent, task.env, training)
     key_train, key_act = jax.random.split(key)
     print(f"training a {name} on {task.name} for {num_steps:,} steps ...", flush=True)
-    state = jax.jit(make_trainer(agent, task.env, training))(key_train, task.params).agent_state
-
-    def act(obs: Array) -> Array:
-        return agent.env_action(agent.act(key_act, state, obs, explore=False))
-
-    return jax.jit(jax.vmap(act))
+    state = jax.jit(train)(key_train, task.params).agent_state
+    act = functools.partial(agent.act, key_act, state, explore=False)
+    return jax.jit(jax.vmap(lambda obs: agent.env_action(act(obs))))
 
 
 # --- copies ---------------------------------------------------------------------------------------
@@ -183,7 +175,7 @@ def copied(
         layers = fit(config, task, states, actions, scale, key_fit)
     tested, copy_return = visit(task, acting(task, layers), key, config.episodes)
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
-    real_steps = len(states) + len(tested) + (config.agent_steps if is_agent(policy) else 0)
+    real_steps = len(states) + len(tested) + config.agent_steps * is_agent(policy)
     costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
     return [Lesson(0, layers, own_states, policy_return)], pd.DataFrame(costs)
 
@@ -279,41 +271,32 @@ def fit(
     key_init, key_fit = jax.random.split(key)
     sizes = [task.obs_dim, *[config.hidden_size] * (config.hidden_size > 0), task.action_dim]
     keys = jax.random.split(key_init, len(sizes) - 1)
-    params = [
-        (jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out))
-        for k, n_in, n_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
-    ]
+    params = []
+    for k, (n_in, n_out) in zip(keys, itertools.pairwise(sizes), strict=True):
+        params.append((jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out)))
     optimiser = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.steps))
-
-    def outputs(params: Any, x: Float[Array, "batch inputs"]) -> Array:
-        *hidden, (kernel, bias) = params
-        for inner, shift in hidden:
-            x = jax.nn.relu(x @ inner.T + shift)
-        return x @ kernel.T + bias
 
     def loss(params: Any, key: Array) -> Array:
         rows = jax.random.randint(key, (_BATCH_SIZE,), 0, len(inputs))
-        given, wanted = outputs(params, inputs[rows]), targets[rows]
+        outputs, wanted = evaluate(params, inputs[rows]), targets[rows]
         if is_discrete:
-            return optax.softmax_cross_entropy_with_integer_labels(given, wanted).mean()
-        clipped = jnp.clip(given, -1.0, 1.0)
+            return optax.softmax_cross_entropy_with_integer_labels(outputs, wanted).mean()
+        clipped = jnp.clip(outputs, -1.0, 1.0)
         # Beyond a bound that is wrong, clipping has no slope: tanh pulls back.
-        pull = 0.1 * (jnp.tanh(given) - wanted) ** 2
-        return jnp.mean((clipped - wanted) ** 2 + _OVERSHOOT * (given - clipped) ** 2 + pull)
+        pull = 0.1 * (jnp.tanh(outputs) - wanted) ** 2
+        return jnp.mean((clipped - wanted) ** 2 + _OVERSHOOT * (outputs - clipped) ** 2 + pull)
 
-    @jax.jit
-    def run(params: Any, key: Array) -> Any:
-        def step(carry: Any, key: Array) -> tuple[Any, None]:
-            params, state = carry
-            updates, state = optimiser.update(jax.grad(loss)(params, key), state)
-            return (optax.apply_updates(params, updates), state), None
+    def step(carry: Any, key: Array) -> tuple[Any, None]:
+        params, state = carry
+        updates, state = optimiser.update(jax.grad(loss)(params, key), state)
+        return (optax.apply_updates(params, updates), state), None
 
-        keys = jax.random.split(key, config.steps)
-        return jax.lax.scan(step, (params, optimiser.init(params)), keys)[0][0]
-
-    fitted = [(np.asarray(k, float), np.asarray(b, float)) for k, b in run(params, key_fit)]
-    kernel, bias = fitted[0]
-    fitted[0] = (kernel / std, bias - (kernel / std) @ mean)
-    kernel, bias = fitted[-1]
-    fitted[-1] = (task.max_action * kernel, task.max_action * bias)
-    return fitted
+    keys = jax.random.split(key_fit, config.steps)
+    run = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys)[0][0])
+    fitted = run(params, optimiser.init(params))
+    layers = [(np.asarray(k, float), np.asarray(b, float)) for k, b in fitted]
+    kernel, bias = layers[0]
+    layers[0] = (kernel / std, bias - (kernel / std) @ mean)
+    kernel, bias = layers[-1]
+    layers[-1] = (task.max_action * kernel, task.max_action * bias)
+    return layers

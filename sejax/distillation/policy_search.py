@@ -79,12 +79,9 @@ class SearchConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.num_top <= self.num_directions,
-            "search.num_top",
-            f"must be at most search.num_directions; got {self.num_top} of "
-            f"{self.num_directions}. Set search.num_top={self.num_directions}.",
-        )
+        most = self.num_directions
+        got = f"got {self.num_top} of {most}. Set search.num_top={most}"
+        require(self.num_top <= most, "search.num_top", f"must be at most all directions; {got}.")
 
 
 class Policy(NamedTuple):
@@ -128,9 +125,8 @@ class Generation(NamedTuple):
     num_steps: Int[Array, ""]
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
-    """The functions of a search; each is pure.
+class Search(NamedTuple):
+    """The pure functions of a search.
 
     Attributes:
       init: `() -> Policy`, one that does nothing.
@@ -174,27 +170,20 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     """
     require_vectors(task)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
-    shape = task.action_dim, task.obs_dim + 1
-    play = make_tester(agent, task, 1)
-    record_one = make_recorder(agent, task, 1)
+    shape, num_episodes = (task.action_dim, task.obs_dim + 1), 2 * config.num_directions
+    play, record_one = make_tester(agent, task, 1), make_recorder(agent, task, 1)
 
     def init() -> Policy:
         zeros = jnp.zeros(task.obs_dim)
         return Policy(jnp.zeros(shape), jnp.float32(0), zeros, zeros)
 
     def episode(key: Array, policy: Policy, size: Array, limit: Array) -> tuple[Array, Array]:
-        """The return of an episode with an error of its own, and its steps."""
+        """The return of an episode with an error of this size, and its steps."""
         key_error, key_play = jax.random.split(key)
-        error = size * random_map(key_error, shape)
-        policy = policy._replace(weights=policy.weights + error)
-        tests = play(key_play, policy, params=task.params.replace(max_steps_in_episode=limit))
+        weights = policy.weights + size * random_map(key_error, shape)
+        params = task.params.replace(max_steps_in_episode=limit)
+        tests = play(key_play, policy._replace(weights=weights), params=params)
         return tests.returns[0], tests.num_steps[0]
-
-    def error_size(policy: Policy) -> Array:
-        size = jnp.float32(config.policy_error)
-        if task.num_actions is not None:  # only the outputs' relative size counts
-            size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
-        return jnp.broadcast_to(size, 2 * config.num_directions)
 
     width = 1 if task.num_actions is None else None
     spread = spread_over_devices(episode, devices, cpu_num_parallel=width)
@@ -205,15 +194,16 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         weights = policy.weights + config.noise_std * jnp.concatenate([directions, -directions])
         # Both ways of a direction have the same initial state and error.
         keys = jnp.tile(jax.random.split(key_episodes, config.num_directions), 2)
-        tried = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(weights), *x.shape)), policy)
+        tried = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_episodes, *x.shape)), policy)
+        size = jnp.float32(config.policy_error)
+        if task.num_actions is not None:  # only the outputs' relative size counts
+            size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
         limit = jnp.int32(task.max_steps)
         if config.short_steps is not None:
             is_short = number < config.short_generations
             limit = jnp.where(is_short, min(config.short_steps, task.max_steps), limit)
-        limits = jnp.broadcast_to(limit, len(weights))
-        returns, num_steps = spread(
-            keys, tried._replace(weights=weights), error_size(policy), limits
-        )
+        sizes, limits = (jnp.broadcast_to(x, num_episodes) for x in (size, limit))
+        returns, num_steps = spread(keys, tried._replace(weights=weights), sizes, limits)
         plus, minus = jnp.split(_finite(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
@@ -223,12 +213,8 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         policy = with_moments(policy._replace(weights=policy.weights + step), seen.obs, seen.valid)
         return policy, Generation(returns, num_steps.sum() + seen.valid.sum())
 
-    return Search(
-        init=init,
-        generation=generation,
-        test=make_tester(agent, task, config.num_tests),
-        record=make_recorder(agent, task, config.num_tests),
-    )
+    test, record = (make(agent, task, config.num_tests) for make in (make_tester, make_recorder))
+    return Search(init=init, generation=generation, test=test, record=record)
 
 
 def random_map(key: Array, shape: tuple[int, ...]) -> Float[Array, "... inputs"]:
@@ -313,80 +299,57 @@ def searched(
     Returns:
       The lessons, and a row of `COLUMNS` for each policy that was tested.
     """
-    search = _Search(options, task, keys, store, devices)
-    firsts = range(0, options.generations, options.test_every)
-    num_tried = -(-min(options.start_generations, options.generations) // options.test_every)
-    ends = [search.advance(i, firsts[:num_tried], search.init()) for i in range(options.num_starts)]
-    best = int(max(search.tested, key=_test_mean)["start"])
-    search.advance(best, firsts[num_tried:], ends[best])
-    went_on = [tested for tested in search.tested if tested["start"] == best]
-    parts = np.array_split(np.arange(len(went_on)), num_lessons)
-    lessons = [search.lesson(max((went_on[i] for i in part), key=_test_mean)) for part in parts]
-    rows = [{name: tested[name].item() for name in COLUMNS} for tested in search.tested]
-    return lessons, pd.DataFrame(rows)
+    search = Search(*(jax.jit(function) for function in make_search(options, task, devices)))
+    rows: list[Arrays] = []  # of tested policies, in their order
 
+    def climb(start: int, first: int, policy: Policy) -> Arrays:
+        """The policy after the generations from `first` up to its next test, and its row."""
+        started, num_steps = time.process_time(), 0
+        last = min(first + options.test_every, options.generations)
+        key_search, key_test = (jax.random.fold_in(keys[use], start) for use in ("search", "test"))
+        for number in range(first, last):
+            key = jax.random.fold_in(key_search, number)
+            policy, tried = search.generation(key, policy, number)
+            num_steps += int(tried.num_steps)
+        tests = search.test(jax.random.fold_in(key_test, last), policy)
+        mean, std = float(tests.returns.mean()), float(tests.returns.std())
+        real_steps, cpu_s = num_steps + int(tests.num_steps.sum()), time.process_time() - started
+        print(f"start {start}, generation {last}: policy {mean:.1f} ± {std:.1f}", flush=True)
+        row = dict(zip(COLUMNS, (start, last, mean, std, real_steps, cpu_s), strict=True))
+        return {name: np.asarray(value) for name, value in (policy._asdict() | row).items()}
 
-class _Search:
-    """A search whose steps are kept; `tested` has a policy and its row for each, in their order."""
-
-    def __init__(
-        self,
-        options: SearchConfig,
-        task: Task,
-        keys: dict[str, Array],
-        store: Store,
-        devices: int | None,
-    ):
-        self._options, self._task, self._keys, self._store = options, task, keys, store
-        search = make_search(options, task, devices)
-        self.init, self._generation = search.init, jax.jit(search.generation)
-        self._test, self._record = jax.jit(search.test), jax.jit(search.record)
-        self.tested: list[Arrays] = []
-
-    def advance(self, start: int, firsts: Sequence[int], policy: Policy) -> Policy:
+    def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
         """The policy of a start after the blocks of generations that begin with these."""
         for first in firsts:
-            climb = functools.partial(self._climb, start, first, policy)
-            self.tested.append(self._store.once(f"search/start{start}-{first}", climb))
-            policy = _policy_of(self.tested[-1])
+            compute = functools.partial(climb, start, first, policy)
+            rows.append(store.once(f"search/start{start}-{first}", compute))
+            policy = _policy_of(rows[-1])
         return policy
 
-    def lesson(self, tested: Arrays) -> Lesson:
-        """A tested policy, with what it visits in other episodes: tests had a part in choosing."""
-        started, generation = time.process_time(), int(tested["generation"])
-        policy = _policy_of(tested)
-        seen = self._record(jax.random.fold_in(self._keys["record"], generation), policy)
-        valid = np.asarray(seen.valid)
-        states, total = np.asarray(seen.obs)[valid], float(np.asarray(seen.reward)[valid].sum())
-        layers = policy.layers(self._task.max_action)
-        tested["real_steps"] = tested["real_steps"] + len(states)
-        tested["cpu_s"] = tested["cpu_s"] + time.process_time() - started
-        return Lesson(generation, layers, states, total / self._options.num_tests)
+    firsts = range(0, options.generations, options.test_every)
+    num_tried = -(-min(options.start_generations, options.generations) // options.test_every)
+    ends = [advance(i, firsts[:num_tried], search.init()) for i in range(options.num_starts)]
+    best = int(max(rows, key=_test_mean)["start"])
+    advance(best, firsts[num_tried:], ends[best])
+    went_on = [row for row in rows if row["start"] == best]
+    parts = np.array_split(np.arange(len(went_on)), num_lessons)
+    chosen = [max((went_on[i] for i in part), key=_test_mean) for part in parts]
+    lessons = [_lesson(options, search, task, keys["record"], row) for row in chosen]
+    return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])
 
-    def _climb(self, start: int, first: int, policy: Policy) -> Arrays:
-        """The policy after the generations up to its next test, and its row."""
-        started, num_steps = time.process_time(), 0
-        last = min(first + self._options.test_every, self._options.generations)
-        key = jax.random.fold_in(self._keys["search"], start)
-        for number in range(first, last):
-            policy, tried = self._generation(jax.random.fold_in(key, number), policy, number)
-            num_steps += int(tried.num_steps)
-        key_test = jax.random.fold_in(jax.random.fold_in(self._keys["test"], start), last)
-        tests = self._test(key_test, policy)
-        row = {
-            "start": start,
-            "generation": last,
-            "test_mean": float(tests.returns.mean()),
-            "test_std": float(tests.returns.std()),
-            "real_steps": num_steps + int(tests.num_steps.sum()),
-            "cpu_s": time.process_time() - started,
-        }
-        print(
-            f"start {start}, generation {last}: policy {row['test_mean']:.1f} ± "
-            f"{row['test_std']:.1f}",
-            flush=True,
-        )
-        return {name: np.asarray(value) for name, value in (policy._asdict() | row).items()}
+
+def _lesson(options: SearchConfig, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:
+    """A tested policy, with what it visits in other episodes: tests had a part in choosing.
+
+    Their cost is added to the row.
+    """
+    started, generation = time.process_time(), int(row["generation"])
+    policy = _policy_of(row)
+    seen = jax.device_get(search.record(jax.random.fold_in(key, generation), policy))
+    states, total = seen.obs[seen.valid], float(seen.reward[seen.valid].sum())
+    row["real_steps"] = row["real_steps"] + len(states)
+    row["cpu_s"] = row["cpu_s"] + time.process_time() - started
+    return Lesson(generation, policy.layers(task.max_action), states, total / options.num_tests)
 
 
 def _policy_of(tested: Arrays) -> Policy:

@@ -18,56 +18,42 @@ from jaxtyping import Array, PyTree
 from sejax.agents import make_agent
 from sejax.agents.base import Agent
 from sejax.distillation.policy_search import Lesson
-from sejax.evaluation import make_evaluator, num_parallel_on_cpu
-from sejax.objectives import Outcome
-from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.io import fingerprint
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
-from sejax.training import TrainingConfig
 
+SE = tuple[ProxyEnv, PyTree]  # environment and weights
 COLUMNS = ("test_return", "train_steps", "real_steps", "cpu_s")  # of a student
 
 
 def students(
-    env: ProxyEnv,
-    weights: Sequence[PyTree],
-    lessons: Sequence[Lesson],
-    config: LearnConfig,
-    keys: Array,
-    store: Store,
+    ses: Sequence[SE], lessons: Sequence[Lesson], config: LearnConfig, keys: Array, store: Store
 ) -> pd.DataFrame:
     """A row for each student on each SE.
 
     The students of an agent are kept in the store before those of the next one train.
 
     Args:
-      env: of the SEs.
-      weights: of each SE.
+      ses: environment and weights of each SE; all have one configuration.
       lessons: that the SEs were made of.
       config: agents and their trainings.
       keys: of the students, `[student]`, the same on all SEs.
       store: where students are kept.
     """
-    tables = []
     # By the weights, as what `policy` names may have changed.
-    taught_by = fingerprint({str(i): each for i, each in enumerate(weights)})
-    lesson, student = (x.ravel().tolist() for x in np.indices((len(lessons), len(keys))))
+    taught_by = fingerprint({str(i): weights for i, (_, weights) in enumerate(ses)})
+    policies = [(lesson.generation, lesson.policy_return) for lesson in lessons]
+    rows = pd.DataFrame(policies, columns=["generation", "policy_return"]).assign(agent="")
+    rows = rows.merge(pd.DataFrame({"student": range(len(keys))}), how="cross")
+    tables = []
     for key, agent_config in config.agents.items():
-        agent = make_agent(agent_config, env.task, config.exploration)
-        train = functools.partial(teach, env, weights, agent, config.training, keys, config.devices)
+        agent = make_agent(agent_config, ses[0][0].task, config.exploration)
+        train = functools.partial(teach, ses, agent, config, keys)
         taught = store.once(f"students/{key}-{taught_by}", train)
-        table = pd.DataFrame(
-            {
-                "generation": [lessons[i].generation for i in lesson],
-                "policy_return": [lessons[i].policy_return for i in lesson],
-                "agent": key,
-                "student": student,
-                **{column: taught[column] for column in COLUMNS},
-            }
-        )
+        table = rows.assign(agent=key, **{column: taught[column] for column in COLUMNS})
         returns = counted(table["test_return"])
         mean, worst = returns.mean(), returns.min()
         print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}", flush=True)
@@ -76,50 +62,31 @@ def students(
 
 
 def teach(
-    env: ProxyEnv,
-    weights: Sequence[PyTree],
-    agent: Agent,
-    training: TrainingConfig,
-    keys: Array,
-    devices: int | None = None,
+    ses: Sequence[SE], agent: Agent, config: LearnConfig, keys: Array
 ) -> dict[str, np.ndarray]:
     """Trains fresh agents on each SE and tests them on the real task.
 
     Args:
-      env: of the SEs.
-      weights: of each SE.
+      ses: environment and weights of each SE; all have one configuration.
       agent: of the students.
-      training: of a student; `test_episodes` are those on the real task.
+      config: its `training` is that of a student, its `devices` are those that students use.
       keys: of the students, `[student]`, the same on all SEs.
-      devices: number of devices that they are spread over; None for all.
 
     Returns:
       By name, `[se * student]` each: `test_return`, the mean over test episodes, nan for a student
       that diverged; `train_steps`; `real_steps`; `cpu_s`, the mean CPU seconds of a student.
     """
-    started = time.process_time()
-    evaluate = make_evaluator(agent, env, env.task, training)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
-    se, student = (indices.ravel() for indices in np.indices((len(weights), len(keys))))
-    print(f"training {len(se)} students ...", flush=True)
-    spread = spread_over_devices(
-        lambda key, one: evaluate(key, env.params(one)),
-        devices,
-        cpu_num_parallel=num_parallel_on_cpu(agent, training),
-    )
-
-    def train_all(keys: Array, stacked: PyTree) -> Outcome:
-        return spread(keys[student], jax.tree.map(lambda leaf: leaf[se], stacked))
-
-    program = jax.jit(train_all, compiler_options=compiler_options())
-    outcome: Outcome = jax.device_get(program(keys, stacked))
-    means = np.asarray(outcome.test_returns, float).mean(axis=-1)
-    return {
-        "test_return": np.where(outcome.nonfinite, np.nan, means),
-        "train_steps": np.asarray(outcome.train_steps),
-        "real_steps": np.asarray(outcome.real_steps),
-        "cpu_s": np.full(len(se), (time.process_time() - started) / len(se)),
-    }
+    started, env = time.process_time(), ses[0][0]
+    print(f"training {len(ses) * len(keys)} students ...", flush=True)
+    evaluate = functools.partial(evaluate_agents, agent, env, devices=config.devices)
+    params = [env.params(weights) for _, weights in ses]
+    outcomes = [evaluate(x, env.task, config.training, keys) for x in params]
+    outcome = jax.device_get(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outcomes))
+    returns = np.asarray(outcome.test_returns, float).mean(axis=-1)
+    returns = np.where(outcome.nonfinite, np.nan, returns)
+    cpu_s = np.full(len(returns), (time.process_time() - started) / len(returns))
+    values = returns, outcome.train_steps, outcome.real_steps, cpu_s
+    return dict(zip(COLUMNS, map(np.asarray, values), strict=True))
 
 
 def counted(returns: pd.Series) -> pd.Series:

@@ -20,13 +20,9 @@ def cache_folder() -> Path | None:
       `SEJAX_CACHE_DIR`, else `sejax` in the user's folder for caches (`XDG_CACHE_HOME`, which is
       `~/.cache` if it is not set). None if `SEJAX_CACHE_DIR` is set to nothing, or nobody's home.
     """
-    root = os.environ.get("SEJAX_CACHE_DIR")
-    if root is not None:
-        return Path(os.path.expanduser(root)) if root else None
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sejax"
-    except RuntimeError:
-        return None
+    default = os.path.join(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "sejax")
+    path = os.path.expanduser(os.environ.get("SEJAX_CACHE_DIR", default))
+    return Path(path) if path and not path.startswith("~") else None
 
 
 def require_writable(field: str, folder: Path) -> None:
@@ -35,17 +31,15 @@ def require_writable(field: str, folder: Path) -> None:
     Raises:
       ConfigError: of this field, if they cannot.
     """
-    made = _missing(folder)
+    new_folders = _missing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        _remove_empty(made)
+        _remove_empty(new_folders)
     except (OSError, ValueError) as error:
-        got = shortened(error)
-        raise ConfigError(
-            f"{field} must be a folder that can be written; got {got}. Set {field}=FOLDER.", field
-        ) from error
+        message = f"{field} must be a folder that can be written; got {shortened(error)}."
+        raise ConfigError(f"{message} Set {field}=FOLDER.", field) from error
 
 
 class FolderLock:
@@ -64,32 +58,30 @@ class FolderLock:
         Raises:
           ConfigError: if another process uses it, or it cannot be written.
         """
-        self._folder, self._made = folder, _missing(folder)
+        self._folder, self._new_folders = folder, _missing(folder)
         self._lock = filelock.FileLock(folder / self.NAME, timeout=0, thread_local=False)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
-        except filelock.Timeout as error:
-            must = f"must be used by one at a time; got {folder}, which another process uses"
-            raise ConfigError(f"{field} {must}. {hint}", field) from error
         except (OSError, ValueError, NotImplementedError) as error:
-            got = f"{shortened(folder)} ({shortened(error)})"
-            must = f"must be a folder that can be written; got {got}"
-            raise ConfigError(f"{field} {must}. {hint}", field) from error
+            is_used = isinstance(error, filelock.Timeout)
+            why = "which another process uses" if is_used else shortened(error)
+            message = (
+                f"{field} must be a folder that can be written; got {shortened(folder)}, {why}."
+            )
+            raise ConfigError(f"{message} {hint}", field) from error
 
     def release(self, is_used: bool) -> None:
         """Lets other processes use the folder; leaves nothing behind unless `is_used`."""
-        if not self._lock.is_locked:
-            return
-        if not is_used:
+        if self._lock.is_locked and not is_used:
             (self._folder / self.NAME).unlink(missing_ok=True)
-            _remove_empty(self._made)
+            _remove_empty(self._new_folders)
         self._lock.release()
 
 
 def _missing(folder: Path) -> list[Path]:
     """A folder and those above it that are not there, the innermost first."""
-    return [x for x in (folder, *folder.parents) if not os.path.exists(x)]
+    return [path for path in (folder, *folder.parents) if not os.path.exists(path)]
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
-from sejax.options import Options, require
+from sejax.options import Options, as_text, require, shortened
 
 # A reward or an entry of a state that networks make ends the episode beyond this; what is the real
 # task's own may be larger. It is far outside what networks of sane weights make, and small enough
@@ -74,6 +74,12 @@ class ProxyConfig(Options, ABC):
           ConfigError: if it is not.
         """
 
+    def _require(self, holds: object, name: str, value: object, why: str) -> None:
+        """Checks a field of which something else leaves one value; `why` follows that value."""
+        field, fix, got = f"{self.group}.{name}", as_text(value), as_text(getattr(self, name))
+        must = f"must be {fix} {shortened(why, 120)}"
+        require(holds, field, f"{must}; got {shortened(got)}. Set {field}={fix}.")
+
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":
         """The proxy of a task."""
@@ -99,18 +105,9 @@ class ProxyEnv(Environment, ABC):
       config: the configuration that it was made from.
       bare: the same without default params: one object for all stored proxies of a configuration.
       learned_config: what a stored proxy was learned with, nested plain values; None for others.
-
-    Raises:
-      ConfigError: for a configuration that does not derive from `ProxyConfig`.
     """
 
     def __init__(self, task: Task, config: ProxyConfig):
-        name = type(config).__name__
-        require(
-            isinstance(config, ProxyConfig),
-            "proxy",
-            f"must derive from sejax.ProxyConfig; got {name}. Set class {name}(sejax.ProxyConfig).",
-        )
         self.spaces = task.observation, task.action
         self.task = task
         self.config: Any = config  # of the class that made it, with its own fields
@@ -132,10 +129,7 @@ class ProxyEnv(Environment, ABC):
         return ProxyParams(weights=weights, max_steps_in_episode=self.max_steps)
 
     def prepare(
-        self,
-        params: PyTree,
-        discount: Array | float | None,
-        limit_is_terminal: Array | bool = False,
+        self, params: PyTree, discount: Array | float | None, limit_is_terminal: bool = False
     ) -> Any:
         """The same params for the whole training of one agent.
 

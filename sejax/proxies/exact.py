@@ -34,10 +34,7 @@ _MOST_NOISE = 12.0
 
 
 def make_exact(
-    task: Task,
-    layers: Sequence[Layer],
-    states: np.ndarray,
-    independent_starts: bool = False,
+    task: Task, layers: Sequence[Layer], states: np.ndarray, independent_starts: bool = False
 ) -> tuple[ProxyEnv, dict[str, Any]]:
     """A one-step SE whose best policy is a given one.
 
@@ -78,33 +75,25 @@ def make_exact(
         activation="relu",
         reward_form="network" if is_discrete else "distance",
     )
-    starts = gaussian(states, independent_starts)
     weights = {
         "reward": _as_weights(reward, config.hidden_size),
-        "start": _as_weights(starts, config.start_hidden_size),
+        "start": _as_weights(gaussian(states, independent_starts), config.start_hidden_size),
     }
     return config.make(task), weights
 
 
 def _require_fit(task: Task, layers: Sequence[Layer], states: np.ndarray) -> None:
     require_vectors(task)
-    require(
-        states.shape[1:] == (task.obs_dim,) and len(states) > 1 and np.isfinite(states).all(),
-        "states",
-        f"must be several of {task.obs_dim} finite numbers each; got others, of the shape "
-        f"{list(states.shape)}. Set observations that the policy visited.",
-    )
+    is_fit = states.shape[1:] == (task.obs_dim,) and len(states) > 1 and np.isfinite(states).all()
+    must = f"must be finite observations that the policy visited, [state, {task.obs_dim}]"
+    require(is_fit, "states", f"{must}; got others, {list(states.shape)}.")
     sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
     shapes = [kernel.shape for kernel, _ in layers]
-    fitting = [*zip(sizes[1:], sizes[:-1], strict=True)]
-    require(
-        shapes == fitting and sizes[-1] == task.action_dim and len(layers) > 0,
-        "policy",
-        f"must map {task.obs_dim} numbers to {task.action_dim}, each layer what the one before it "
-        f"gives; got kernels of the shapes {shapes}. Set layers=[(kernel, bias)].",
-    )
+    is_chain = shapes == [*zip(sizes[1:], sizes[:-1], strict=True)] and len(layers) > 0
     is_finite = all(np.isfinite(numbers).all() for layer in layers for numbers in layer)
-    require(is_finite, "policy", "must have finite numbers; got others. Set another policy.")
+    must = f"must be finite layers from {task.obs_dim} numbers to {task.action_dim}"
+    is_policy = is_chain and sizes[-1] == task.action_dim and is_finite
+    require(is_policy, "policy", f"{must}; got {shapes}. Set layers=[(kernel, bias)].")
 
 
 def require_vectors(task: Task) -> None:
@@ -113,20 +102,17 @@ def require_vectors(task: Task) -> None:
     Raises:
       ConfigError: if they are not.
     """
-    require(
-        task.num_states is None,
-        "env",
-        f"must have vectors as observations; got {task.name}. Set env=cartpole.",
-    )
+    must = f"must have vectors as observations; got {task.name}. Set env=cartpole."
+    require(task.num_states is None, "env", must)
 
 
 def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:
     """The policy in units of the bound, with a hidden layer at least: x is relu(x) - relu(-x)."""
     *hidden, (kernel, bias) = layers
     if not hidden:
-        size = len(kernel)
-        hidden = [(np.concatenate([kernel, -kernel]), np.zeros(2 * size))]
-        kernel = np.concatenate([np.eye(size), -np.eye(size)], axis=1)
+        unit = np.eye(len(kernel))
+        hidden = [(np.concatenate([kernel, -kernel]), np.zeros(2 * len(kernel)))]
+        kernel = np.concatenate([unit, -unit], axis=1)
     return [*hidden, (kernel / bound, bias / bound)]
 
 
@@ -138,7 +124,7 @@ def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
     """
     outputs = evaluate(layers, states)
     size = outputs.shape[1]
-    better, chosen = np.nonzero(~np.eye(size, dtype=bool))  # [pair] each
+    better, chosen = np.nonzero(~np.eye(size, dtype=bool))  # [pair], both
     differences = np.abs(outputs[:, better] - outputs[:, chosen])
     margin = max(float(np.quantile(differences, 0.1)), 1e-6 * float(np.abs(outputs).max()), 1e-9)
     # The network's input is the one-hot action before the observation; each layer hands it on.
@@ -146,13 +132,11 @@ def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
         (block_diag(np.eye(size), kernel), np.concatenate([np.zeros(size), bias]))
         for kernel, bias in layers
     )
-    action, output, own = kernel[:size], kernel[size:] / margin, bias[size:] / margin
-    apart, shift = output[better] - output[chosen], own[better] - own[chosen]
+    action, output, shift = kernel[:size], kernel[size:] / margin, bias[size:] / margin
+    apart, shift = output[better] - output[chosen], shift[better] - shift[chosen]
     # relu(x) - relu(x - 1) is clip(x, 0, 1).
-    clipped = (
-        np.concatenate([action, apart, apart]),
-        np.concatenate([bias[:size], shift, shift - 1]),
-    )
+    kernel = np.concatenate([action, apart, apart])
+    clipped = kernel, np.concatenate([bias[:size], shift, shift - 1])
     # relu(clip - 1 + a) is clip for the action that was chosen, and 0 for others.
     pairs = np.eye(len(better))
     costs = np.concatenate([np.eye(size)[chosen], pairs, -pairs], axis=1), -np.ones(len(better))
@@ -190,10 +174,13 @@ def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     return weights
 
 
-def evaluate(layers: Sequence[Layer], states: np.ndarray) -> np.ndarray:
-    """The policy's outputs in states `[state, obs_dim]`, before clipping; `[state, action_dim]`."""
-    *hidden, last = layers
-    values = states
-    for kernel, bias in hidden:
-        values = np.maximum(values @ kernel.T + bias, 0.0)
-    return np.asarray(values @ last[0].T + last[1])
+def evaluate(layers: Sequence[Layer], inputs: Any) -> Any:
+    """The policy's outputs `[state, action_dim]` for states `[state, obs_dim]`, before clipping.
+
+    Of NumPy or JAX.
+    """
+    *hidden, (kernel, bias) = layers
+    for inner, shift in hidden:
+        inputs = inputs @ inner.T + shift
+        inputs = inputs * (inputs > 0)
+    return inputs @ kernel.T + bias

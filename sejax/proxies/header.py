@@ -7,6 +7,7 @@ executed, resolved or imported when it is read. `sejax.proxies.io` makes environ
 """
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +17,7 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import (
-    LARGEST,
-    ConfigError,
-    is_number,
-    registry,
-    require,
-    shortened,
-    unknown_name,
-)
+from sejax.options import LARGEST, ConfigError, is_number, one_of, registry, require, shortened
 from sejax.options.plain import expanded, from_plain
 from sejax.proxies import hub
 
@@ -35,7 +28,6 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
 _KIND = "sejax"  # of the metadata's entry
-_LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,20 +56,23 @@ class Header:
     proxies: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        if self.format_version != FORMAT_VERSION:
-            raise ValueError(f"format {self.format_version} in place of {FORMAT_VERSION}")
-        if not all(isinstance(self.config[group], Mapping) for group in ("env", "proxy")):
-            raise ValueError("no task or proxy")
-        if not self.proxies or not all(isinstance(record, Mapping) for record in self.proxies):
-            raise ValueError("no records")
-        numbers = [self.discount, *(x for record in self.proxies for x in _numbers_of(record))]
+        parts = [self.config["env"], self.config["proxy"], *self.proxies]
+        is_whole = self.proxies and all(isinstance(part, Mapping) for part in parts)
+        if self.format_version != FORMAT_VERSION or not is_whole:
+            raise ValueError(f"format {self.format_version}, or a part that is missing")
+        numbers = [self.discount]
+        for record in self.proxies:
+            numbers += [record[name] for name in ("score", "generation", "seed") if name in record]
+            numbers += dict(record.get("scores", {})).values()
         if not (all(map(is_number, numbers)) and 0 <= self.discount <= 1):
             raise ValueError("a record without numbers, or a discount outside of [0, 1]")
         np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
-        if not (
-            _is_count(spec.max_steps) and _is_space(spec.observation) and _is_space(spec.action)
-        ):
+        sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
+        are_counts = all(type(size) is int and 0 < size <= LARGEST for size in sizes)
+        with np.errstate(over="ignore"):  # nan, and bounds beyond single precision, are changed
+            is_same = spec.interface == self.interface
+        if not (are_counts and is_same):
             raise ValueError("a space or step limit that no task has")
 
     @property
@@ -105,26 +100,13 @@ class Stored(NamedTuple):
     header: Header
 
 
-def _numbers_of(record: Mapping[str, Any]) -> list[Any]:
-    """What must be numbers in a record, if it is there."""
-    known = [record[name] for name in ("score", "generation", "seed") if name in record]
-    return [*known, *dict(record.get("scores", {})).values()]
-
-
-def _is_count(number: object) -> bool:
-    return type(number) is int and 0 < number <= LARGEST
-
-
-def _is_space(space: Space) -> bool:
-    """Whether a space has entries, bounds of single precision in their order, and a fit shape."""
+def _sizes_of(space: Space) -> list[int]:
+    """The numbers that count something in a space; 0 if its bounds or its shape do not fit."""
     if not isinstance(space, Box):
-        return _is_count(space.n)
-    image = space.image
-    is_image = len(image) == 3 and all(map(_is_count, image)) and math.prod(image) == space.size
-    low, high = bounds = np.array([space.low, space.high], float)
-    is_float = np.isinf(bounds) | (np.abs(bounds) <= _LARGEST_FLOAT)
-    is_ordered = (low <= high) & (low < np.inf) & (high > -np.inf)
-    return bool((not image or is_image) and low.size and is_float.all() and is_ordered.all())
+        return [space.n]
+    is_image = len(space.image) == 3 and math.prod(space.image) == space.size
+    are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
+    return [space.size * are_bounds * (is_image or not space.image), *space.image]
 
 
 def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
@@ -136,15 +118,13 @@ def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
 
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Plain values of a configuration's agent, or of its mixture of agents, by their keys."""
-    mixture = config.get("agents")
-    if not isinstance(mixture, Mapping):
-        agent = config.get("agent")
-        return {str(agent.get("name")) if isinstance(agent, Mapping) else "": agent}
-    return {
-        key: {name: x for name, x in values.items() if name != "weight"}
-        for key, values in mixture.items()
+    agent, mixture = config.get("agent"), config.get("agents")
+    agents: dict[str, Any] = {
+        key: {name: value for name, value in values.items() if name != "weight"}
+        for key, values in (mixture.items() if isinstance(mixture, Mapping) else ())
         if isinstance(values, Mapping)
     }
+    return agents or {str(agent.get("name")) if isinstance(agent, Mapping) else "": agent}
 
 
 def is_registered(group: str, stored: object) -> bool:
@@ -169,11 +149,9 @@ def configured(group: str, values: object, where: str, option: str = "") -> Any:
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field = PLUGIN_ARGUMENTS.get(group, group)
     words = f", or {PLUGIN_WORDS[group]}=MODULE:NAME in a command" if option else ""
-    raise ConfigError(
-        f"{option or field} must have a registered {group}, because what a file names is never "
-        f"imported; got {shortened(name, 40)} in {shortened(where, 40)}. Set {field}=...{words}.",
-        field,
-    )
+    must = f"must have a registered {group}, because what a file names is never imported"
+    got = f"got {shortened(name, 40)} in {shortened(where, 40)}"
+    raise ConfigError(f"{option or field} {must}; {got}. Set {field}=...{words}.", field)
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -195,26 +173,18 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     Raises:
       ConfigError: if there is none, or it cannot be fetched.
     """
-    if hub.is_address(source):
-        return hub.fetch(str(source), option)
-    name, text = str(source), shortened(source)
-    try:
-        path = Path(expanded(name))
-        file = path / hub.FILE if path.is_dir() else path
-        if file.is_file():
-            return file
-    except (OSError, ValueError) as error:
-        message = f"{option} must be a path or a name; got {text} ({type(error).__name__})."
-        raise ConfigError(message, option) from None
-    written = "which the first generation of a run writes"
-    require(
-        not path.is_dir(), option, f"must be a folder with a {hub.FILE}, {written}; got {text}."
-    )
-    is_path = path.suffix or len(path.parts) != 1
-    must = "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO"
-    require(not is_path, option, f"{must}; got {text}, which does not exist.")
+    name = str(source)
+    if hub.is_address(name):
+        return hub.fetch(name, option)
+    path = expanded(name)
+    file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path
+    if os.path.isfile(file):
+        return Path(file)
+    if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
+        there = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
+        raise ConfigError(f"{option} {there}; got {shortened(name)}, where there is none.", option)
     if name not in pretrained_names():
-        raise unknown_name(option, text, [*pretrained_names(), *also])
+        one_of([*pretrained_names(), *also])(option, shortened(name), None)
     return PRETRAINED_DIR / f"{name}.safetensors"
 
 
@@ -242,17 +212,14 @@ def read(
         tensors, plain = checksummed.read(path, _KIND)
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
-        raise ConfigError(
-            f"{option} must be a proxy's file as sejax writes it; got {where}, which is damaged or "
-            f"of another format ({shortened(error, 60)}). The run writes it again.",
-            option,
-        ) from error
+        got = f"got {where} ({shortened(error, 60)})"
+        raise ConfigError(f"{option} must be whole, as sejax wrote it; {got}.", option) from error
     must = f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}"
     got = f"got proxy={shortened(header.kind, 40)} in {where}"
     require(not kinds or header.kind in kinds, option, f"{must}; {got}.")
-    count = len(header.proxies)
-    got = f"got a set of {count} in {where}. sejax.load_set reads sets"
-    require(not single or count == 1, option, f"must be a single proxy; {got}.")
+    is_one = len(header.proxies) == 1 or not single
+    got = f"got a set in {where}. sejax.load_set reads sets"
+    require(is_one, option, f"must be a single proxy; {got}.")
     return Stored(path, tensors, header)
 
 
@@ -275,10 +242,7 @@ def packed(tensors: dict[str, np.ndarray], header: Header) -> bytes:
 
 
 def check_tensors(
-    field: str,
-    tensors: Mapping[str, np.ndarray],
-    shapes: Mapping[str, tuple[int, ...]],
-    fix: str,
+    field: str, tensors: Mapping[str, np.ndarray], shapes: Mapping[str, Any], fix: str
 ) -> None:
     """Checks that tensors are those of the networks that a configuration describes.
 
@@ -293,9 +257,6 @@ def check_tensors(
     """
     got = {name: x.shape for name, x in tensors.items()}
     are_numbers = all(x.dtype == np.float32 and np.isfinite(x).all() for x in tensors.values())
-    require(
-        got == shapes and are_numbers,
-        field,
-        f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}; got "
-        f"{shortened(got, 60) if got != shapes else 'others'}. Set {field} to {fix}.",
-    )
+    must = f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}"
+    others = shortened(got, 60) if got != shapes else "other numbers"
+    require(got == shapes and are_numbers, field, f"{must}; got {others}. Set {field} to {fix}.")

@@ -40,12 +40,17 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
       >>> parse("hf://user/repo@v1")
       ('user/repo', 'v1', 'proxy.safetensors')
     """
-    found = _ADDRESS.fullmatch(address) if len(address) < 500 else None
-    if found is None:
-        must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
+    match = _ADDRESS.fullmatch(address) if len(address) < 500 else None
+    must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
+    if match is None:
         raise ConfigError(f"{option} {must}; got {shortened(repr(address))}.", option)
-    repo, revision, file = found.groups()
+    repo, revision, file = match.groups()
     return repo, revision, file or FILE
+
+
+def is_repo(repo: object) -> bool:
+    """Whether it is `USER/REPO`."""
+    return re.fullmatch(_REPO, str(repo), re.ASCII) is not None
 
 
 def fetch(address: str, option: str = "source") -> Path:
@@ -64,20 +69,9 @@ def fetch(address: str, option: str = "source") -> Path:
         from huggingface_hub import hf_hub_download
 
         size = hf_hub_download(repo, file, revision=revision, dry_run=True).file_size
-        got = f"got {size} bytes at {address}"
         is_small = size is not None and size <= MAX_BYTES
-        require(is_small, option, f"must have at most {MAX_BYTES:,} bytes; {got}.")
+        require(is_small, option, f"must have at most {MAX_BYTES:,} bytes; got {size} there.")
         return Path(hf_hub_download(repo, file, revision=revision))
-
-
-def require_repo(repo: object) -> None:
-    """Checks the name of a repository.
-
-    Raises:
-      ConfigError: if it is not `USER/REPO`.
-    """
-    is_name = isinstance(repo, str) and re.fullmatch(_REPO, repo, re.ASCII)
-    require(is_name, "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
 
 
 def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -> None:
@@ -95,23 +89,22 @@ def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -
     with _explained("repo", repo):
         from huggingface_hub import CommitOperationAdd, HfApi
 
-        api = HfApi()
-        api.create_repo(repo, private=private, exist_ok=True)
+        HfApi().create_repo(repo, private=private, exist_ok=True)
         additions = [CommitOperationAdd(name, content) for name, content in files.items()]
-        api.create_commit(repo, additions, commit_message=message)
+        HfApi().create_commit(repo, additions, commit_message=message)
 
 
 @contextlib.contextmanager
-def _explained(option: str, place: str) -> Iterator[None]:
+def _explained(option: str, address: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
     try:
         yield
     except ConfigError:
         raise
     except Exception as error:  # the HTTP library's too, which differs between its versions
+        is_missing = isinstance(error, ImportError)
         fix = "Check the name and the network, or log in: hf auth login"
-        if isinstance(error, ImportError):
-            fix = "Install it with pip install 'sejax[hub]'"
-        got = f"got {shortened(place, 60)}: {shortened(told(error), 90)}"
+        fix = "Install it with pip install 'sejax[hub]'" if is_missing else fix
+        got = f"got {shortened(address, 60)}: {shortened(told(error), 90)}"
         message = f"{option} must be within reach on the Hub; {got}. {fix}."
         raise ConfigError(message, option) from error

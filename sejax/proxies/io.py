@@ -12,7 +12,7 @@ from typing import Any, NoReturn, overload
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from sejax import envs
 from sejax.agents import Agent, make_agent
@@ -21,23 +21,13 @@ from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import write_bytes
-from sejax.options import (
-    ConfigError,
-    as_python,
-    one_of,
-    registry,
-    require,
-    shortened,
-    told,
-    unknown_name,
-)
+from sejax.options import ConfigError, as_python, registry, require, shortened, told, unknown_name
+from sejax.options.parts import require_part
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
 from sejax.training import TrainingConfig
-
-NONE = {"name": "none"}  # the exploration where a file tells none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +54,7 @@ class _Loaded:
           ConfigError: if it cannot be made here, and the file told what the proxy needs of it.
         """
         if isinstance(self.env.task.env, AbsentEnv):
-            self.env.task.env.fail()
+            self.env.task.env.reset_env()
         return self.env.task
 
     def learned_with(self, group: str) -> Any:
@@ -80,10 +70,11 @@ class _Loaded:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        one_of(registry.GROUPS)("group", str(group), None)
-        learned = agents_of(self.config)
-        one = next(iter(learned.values())) if len(learned) == 1 else None
-        values = one if group == "agent" else self.config.get(group)
+        if group not in registry.GROUPS:
+            raise unknown_name("group", group, registry.GROUPS)
+        agents = [*agents_of(self.config).values()]
+        agent = agents[0] if len(agents) == 1 else None
+        values = agent if group == "agent" else self.config.get(group)
         return header.configured(group, values, self.path.name)
 
     def learned_agents(self) -> dict[str, Any]:
@@ -159,23 +150,15 @@ class ProxySet(_Loaded):
     @overload
     def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> "ProxySet": ...
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> "Proxy | ProxySet":
-        places = np.arange(len(self))[index]
-        if places.ndim:
-            return dataclasses.replace(
-                self,
-                weights=jax.tree.map(lambda x: x[places], self.weights),
-                records=tuple(self.records[i] for i in places),
-            )
-        weights = jax.tree.map(lambda x: jax.numpy.asarray(x[places]), self.weights)
-        params = self.env.params(weights, self.discount)
-        return Proxy(
-            env=self.env.with_default_params(params, self.config),
-            params=params,
-            record=self.records[places],
-            config=self.config,
-            discount=self.discount,
-            path=self.path,
-        )
+        numbers = np.arange(len(self))[index]
+        weights = jax.tree.map(lambda leaf: leaf[numbers], self.weights)
+        if numbers.ndim:
+            records = tuple(self.records[number] for number in numbers)
+            return dataclasses.replace(self, weights=weights, records=records)
+        params = self.env.params(jax.tree.map(jax.numpy.asarray, weights), self.discount)
+        shared = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Loaded)}
+        shared["env"] = self.env.with_default_params(params, self.config)
+        return Proxy(params=params, record=self.records[numbers], **shared)
 
     @property
     def scores(self) -> np.ndarray:
@@ -193,21 +176,14 @@ class ProxySet(_Loaded):
         return self[(order if worst else order[::-1])[:count]]
 
 
-def stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[str, Any]]:
-    """The environment of a stored proxy, and the configuration that it was learned with.
-
-    Raises:
-      ConfigError: for an argument of another type.
-    """
+def _stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[str, Any]]:
+    """The environment of a stored proxy, and the configuration that it was learned with."""
     if isinstance(proxy, _Loaded):
         return proxy.env, proxy.config
-    config = getattr(proxy, "learned_config", None)
-    require(
-        config is not None,
-        "proxy",
-        f"must be a stored one; got {type(proxy).__name__}. Set env, params = sejax.load(source).",
-    )
-    return proxy, config  # type: ignore[return-value]
+    if isinstance(proxy, ProxyEnv) and proxy.learned_config is not None:
+        return proxy, proxy.learned_config
+    fix = "Set env, params = sejax.load(source)"
+    raise ConfigError(f"proxy must be a stored one; got {type(proxy).__name__}. {fix}.", "proxy")
 
 
 def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Agent:
@@ -225,14 +201,14 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
       >>> agent_of(env, "ppo").spec.learns_from
       0
     """
-    env, config = stored_env(proxy)
+    env, config = _stored_env(proxy)
     stored = agents_of(config)
     name = next(iter(stored)) if name is None else name
     if name not in stored:
         raise unknown_name("name", name, list(stored))
     agent = header.configured("agent", stored[name], env.name)
-    exploration = header.configured("exploration", config.get("exploration", NONE), env.name)
-    return make_agent(agent, env.task, exploration)
+    explored = config.get("exploration", {"name": "none"})
+    return make_agent(agent, env.task, header.configured("exploration", explored, env.name))
 
 
 def training_of(
@@ -252,23 +228,18 @@ def training_of(
       >>> training_of(load_proxy("cartpole")).stop_rule
       'never'
     """
-    env, config = stored_env(proxy)
+    env, config = _stored_env(proxy)
     stored: Any = config.get("training")
-    require(
-        isinstance(stored, Mapping),
-        "training",
-        f"must be given for {shortened(env.name)}, which does not say how long its agents "
-        "trained; got none. Set training=sejax.TrainingConfig(...).",
-    )
-    training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
+    must = f"must be given for {shortened(env.name)}, whose file does not tell it"
+    fix = "Set training=sejax.TrainingConfig(...)"
+    require(isinstance(stored, Mapping), "training", f"{must}; got none. {fix}.")
+    training = from_plain(TrainingConfig, stored, "training")
     if agent is None:
         return training
-    known = [
-        registry.configure("agent", values)
-        for values in agents_of(config).values()
-        if header.is_registered("agent", values)
-    ]
-    return budget_for(training, agent, known, env.max_steps, env.task.max_steps)
+    agents = agents_of(config).values()
+    known = [values for values in agents if header.is_registered("agent", values)]
+    learned_with = [registry.configure("agent", values) for values in known]
+    return budget_for(training, agent, learned_with, env.max_steps, env.task.max_steps)
 
 
 def budget_for(
@@ -296,14 +267,11 @@ def budget_for(
         return training
     if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
         max_steps = min(max_steps, training.max_episodes * max_episode_steps)
-    waits, *waited = (
-        each.steps_before_learning(max_episode_steps, task_max_steps)
-        for each in (agent, *learned_with)
-    )
-    longer = max(0, waits - max(waited, default=0))
-    return dataclasses.replace(
-        training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
-    )
+    limits = max_episode_steps, task_max_steps
+    waited = max((x.steps_before_learning(*limits) for x in learned_with), default=0)
+    longer = max(0, agent.steps_before_learning(*limits) - waited)
+    max_steps, max_episodes = max_steps + longer, training.max_episodes + longer
+    return dataclasses.replace(training, max_steps=max_steps, max_episodes=max_episodes)
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -360,8 +328,8 @@ def save_set(
       OSError: if it cannot be written; an older file stays as it was.
     """
     got = f"got {len(records)} for {len(weights)}. Set records=[{{}}] * len(weights)"
-    is_one_each = len(weights) == len(records) > 0
-    require(is_one_each, "records", f"must be one for each proxy; {got}.")
+    is_fit = len(weights) == len(records) > 0
+    require(is_fit, "records", f"must be one for each proxy; {got}.")
     _write(path, env, weights, records, config, discount, is_set=True)
 
 
@@ -374,18 +342,19 @@ def _write(
     discount: float | None,
     is_set: bool,
 ) -> None:
-    require(
-        discount is not None or not env.config.needs_discount,
-        "discount",
-        "must be given for a potential-based reward network; got None. Set "
-        "discount=params.discount, that of the agent.",
-    )
-    of_proxies = [_tensors_of(env, of_one) for of_one in weights]
-    tensors = {name: np.stack([of_one[name] for of_one in of_proxies]) for name in of_proxies[0]}
-    known = {
-        "env": env.task.origin or {"name": env.task.name},
-        "proxy": registry.describe("proxy", env.config),
-    }
+    is_known = discount is not None or not env.config.needs_discount
+    must = "must be given for a potential-based RN; got None. Set discount=params.discount."
+    require(is_known, "discount", must)
+    stacked: dict[str, list[np.ndarray]] = {}
+    for nested in weights:
+        flat = _flatten(nested) if isinstance(nested, Mapping) else {}
+        tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+        check_tensors("weights", tensors, _shapes_of(env), "params.weights")
+        stacked = {name: [*stacked.get(name, []), x] for name, x in tensors.items()}
+    if is_set:
+        tensors = {name: np.stack(arrays) for name, arrays in stacked.items()}
+    known = {"env": env.task.origin or {"name": env.task.name}}
+    known["proxy"] = registry.describe("proxy", env.config)
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,
@@ -397,23 +366,13 @@ def _write(
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
-        data = header.packed(tensors if is_set else of_proxies[0], stored)
+        data = header.packed(tensors, stored)
     except (LookupError, ValueError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            "config, discount and record must be plain values that sejax.load takes; got "
-            f"{shortened(told(error), 60)}. Set numbers for score, generation and seed, and "
-            "sejax.config(...).plain() for config.",
-            "config",
-        ) from error
+        must = "must be plain values that sejax.load takes, with numbers for score and seed"
+        fix = "Set config=sejax.config(...).plain()"
+        message = f"config and record {must}; got {shortened(told(error), 60)}. {fix}."
+        raise ConfigError(message, "config") from error
     write_bytes(Path(path).expanduser(), data)
-
-
-def _tensors_of(env: ProxyEnv, weights: PyTree) -> dict[str, np.ndarray]:
-    """The weights of one proxy by `network/layer/parameter`, float32."""
-    flat = _flatten(weights) if isinstance(weights, Mapping) else {}
-    tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
-    check_tensors("weights", tensors, _shapes_of(env), "params.weights")
-    return tensors
 
 
 def _flatten(weights: PyTree) -> dict[str, Any]:
@@ -515,44 +474,43 @@ def _proxies_of(
     stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str
 ) -> ProxySet:
     env = _env_of(stored, task, proxy, option)
-    found, tensors = stored.header, stored.tensors
-    if not found.is_set:
+    path, tensors, learned = stored
+    if not learned.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    shapes = {name: (len(found.proxies), *shape) for name, shape in _shapes_of(env).items()}
+    shapes = {name: (len(learned.proxies), *shape) for name, shape in _shapes_of(env).items()}
     check_tensors(option, tensors, shapes, "a file that sejax has written")
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),
-        records=tuple(found.proxies),
-        config=found.config,
-        discount=found.discount,
-        path=stored.path,
+        records=tuple(learned.proxies),
+        config=learned.config,
+        discount=learned.discount,
+        path=path,
     )
 
 
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
-    for name, given, kind in (("task", task, Task), ("proxy", proxy, ProxyConfig)):
-        is_kind = given is None or isinstance(given, kind)
-        got = f"got {shortened(repr(given))}. Leave it out for a registered {name}"
-        require(is_kind, name, f"must be a sejax.{kind.__name__}; {got}.")
-    found, where = stored.header, stored.path.name
+    for name, cls, part in (("task", Task, task), ("proxy", ProxyConfig, proxy)):
+        if part is not None:
+            require_part(name, cls, part, f"Leave it out for a registered {name}.")
+    learned, where = stored.header, stored.path.name
     if proxy is None:
-        proxy = header.configured("proxy", found.config["proxy"], where, option)
+        proxy = header.configured("proxy", learned.config["proxy"], where, option)
     real = task
     if real is None:
         try:
-            real = envs.make_from(header.configured("env", found.config["env"], where, option))
+            real = envs.make_from(header.configured("env", learned.config["env"], where, option))
         except ConfigError as error:
             if proxy.needs_task:
                 raise
-            known = json.dumps([found.interface, found.config["env"]], sort_keys=True)
-            real = _absent_task(found.task, known, str(error))
-    got = f"got one of {shortened(found.task, 40)} in {shortened(where, 40)}. Set another task"
-    is_its_task = found.task == real.name
+            known = json.dumps([learned.interface, learned.config["env"]], sort_keys=True)
+            real = _absent_task(learned.task, known, str(error))
+    got = f"got one of {shortened(learned.task, 40)} in {shortened(where, 40)}. Set another task"
+    is_its_task = learned.task == real.name
     require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
     if task is not None:
-        _require_same(found, task, proxy, where)
+        _require_same(learned, task, proxy, where)
     env: ProxyEnv = registry.make("proxy", proxy, real)
     return env
 
@@ -585,23 +543,14 @@ class AbsentEnv(Environment):
     does not run on. `reset_env` and `step_env` raise the reason as a `ConfigError`.
     """
 
-    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+    def __init__(self, spec: TaskSpec, reason: str):
         super().__init__(spec)
-        self._task_name, self._reason = task_name, reason
+        self._reason = reason
 
-    def fail(self) -> NoReturn:
-        """Raises the reason as a `ConfigError`."""
+    def reset_env(self, *_: Any, **__: Any) -> NoReturn:
         raise ConfigError(self._reason, "task")
 
-    def reset_env(self, key: Array, params: PyTree) -> NoReturn:
-        self.fail()
-
-    def step_env(self, key: Array, state: PyTree, action: Array, params: PyTree) -> NoReturn:
-        self.fail()
-
-    @property
-    def name(self) -> str:
-        return self._task_name
+    step_env = reset_env
 
 
 @functools.cache
@@ -615,8 +564,7 @@ def _absent_task(name: str, known: str, reason: str) -> Task:
     """
     interface, origin = json.loads(known)
     spec = TaskSpec.of_interface(interface)
-    env = AbsentEnv(name, spec, reason)
-    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
+    return Task(name=name, env=AbsentEnv(spec, reason), max_steps=spec.max_steps, origin=origin)
 
 
 # --- gymnax ---------------------------------------------------------------------------------------
@@ -628,11 +576,9 @@ def register_gymnax() -> list[str]:
     Returns:
       The ids, for `gymnax.make`. The environment's `default_params` are the learned weights.
     """
-    import gymnax  # all of its environments, which takes a second
-    from gymnax.registration import registered_envs
+    from gymnax import registration  # all of its environments, which takes a second
 
-    names = header.pretrained_names()
-    for name in names:
-        if f"sejax/{name}" not in registered_envs:
-            gymnax.register(f"sejax/{name}", lambda name=name: load(name)[0])
-    return [f"sejax/{name}" for name in names]
+    ids = {f"sejax/{name}": name for name in header.pretrained_names()}
+    for env_id in ids.keys() - set(registration.registered_envs):
+        registration.register(env_id, lambda name=ids[env_id]: load(name)[0])
+    return list(ids)

@@ -18,17 +18,7 @@ from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
 from sejax.envs.spec import TaskSpec
 from sejax.ops.networks import MLP, uniform_fan_in
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    as_text,
-    counts,
-    one_of,
-    option,
-    positive,
-    require,
-    shortened,
-)
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive, require
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv
 
 
@@ -85,13 +75,8 @@ class RewardConfig(ProxyConfig):
         super().__post_init__()
         defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
         for name, default in defaults.items():
-            value = getattr(self, name)
-            require(
-                value == default or not self.shaping.weighs_info,
-                f"proxy.{name}",
-                f"must be {as_text(default)}, as {self.variant} has no network; got "
-                f"{shortened(value)}. Set proxy.{name}={as_text(default)}.",
-            )
+            is_left = getattr(self, name) == default or not self.shaping.weighs_info
+            self._require(is_left, name, default, f"as {self.variant} has no network")
 
     @property
     def shaping(self) -> Shaping:
@@ -108,18 +93,10 @@ class RewardConfig(ProxyConfig):
         Raises:
           ConfigError: if they do not.
         """
-        fields = (
-            ("variant", self.shaping.weighs_info, spec.info_keys, "additive_potential"),
-            ("augmented", self.augmented, spec.augmented_keys, "false"),
-        )
-        for name, is_needed, is_there, fix in fields:
-            value = getattr(self, name)
-            require(
-                is_there or not is_needed,
-                f"proxy.{name}",
-                f"must do without a step's info in {shortened(task_name)}, which tells nothing of "
-                f"the state; got {value}. Set proxy.{name}={fix}.",
-            )
+        why = f"where a step's info tells nothing of the state, as in {task_name}"
+        can_weigh = spec.info_keys or not self.shaping.weighs_info
+        self._require(can_weigh, "variant", "additive_potential", why)
+        self._require(spec.augmented_keys or not self.augmented, "augmented", False, why)
 
     def make(self, task: Task) -> "RewardEnv":
         """The RN of a task.
@@ -205,10 +182,7 @@ class RewardEnv(ProxyEnv):
         return RewardParams(weights=weights, discount=discount, max_steps_in_episode=self.max_steps)
 
     def prepare(
-        self,
-        params: RewardParams,
-        discount: Array | float | None,
-        limit_is_terminal: Array | bool = False,
+        self, params: RewardParams, discount: Array | float | None, limit_is_terminal: bool = False
     ) -> RewardParams:
         """The same params for the whole training of one agent, with its discount.
 
@@ -218,22 +192,16 @@ class RewardEnv(ProxyEnv):
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.
         """
-        require(
-            discount is not None or not self.config.shaping.is_potential_based,
-            "agent",
-            f"must have a discount for {self.config.variant}; got none. Set "
-            "Agent(discount=lambda hparams: ...).",
-        )
+        is_known = discount is not None or not self.config.needs_discount
+        must = f"must have a discount for {self.config.variant}"
+        require(is_known, "agent", f"{must}; got none. Set Agent(discount=lambda hparams: ...).")
         potentials = None
         if self.task.num_states is not None and not self.config.shaping.weighs_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
-        return dataclasses.replace(
-            params,
-            discount=jnp.float32(1.0 if discount is None else discount),
-            limit_is_terminal=jnp.bool_(limit_is_terminal),
-            potentials=potentials,
-        )
+        known = {"discount": jnp.float32(1.0 if discount is None else discount)}
+        known["limit_is_terminal"] = jnp.bool_(limit_is_terminal)
+        return dataclasses.replace(params, potentials=potentials, **known)
 
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()
@@ -250,34 +218,6 @@ class RewardEnv(ProxyEnv):
         outputs: Any = self._net.apply({"params": weights["potential"]}, inputs)
         return self.config.output_scale * outputs[0]
 
-    def bonus(
-        self,
-        params: RewardParams,
-        state: RewardState,
-        next_state: RewardState,
-        info: Mapping[str, Array],
-        terminated: Array | bool,
-    ) -> Float[Array, ""]:
-        """The learned part of a transition's reward.
-
-        Args:
-          params: weights and discount.
-          state: of the RN before the step.
-          next_state: of the RN after it.
-          info: of the real task's step.
-          terminated: whether the task ended by it.
-        """
-        if self.config.shaping.weighs_info:
-            return params.weights["info_weights"] @ _select(info, self.task.info_keys)
-        after = self.potential(params, next_state.obs, next_state.augmentation)
-        if self.config.zero_at_terminal:
-            is_cut = self.is_truncated(next_state, params)
-            after = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, after)
-        if not self.config.shaping.is_potential_based:
-            return after
-        before = self.potential(params, state.obs, state.augmentation)
-        return params.discount * after - before
-
     def reset_env(self, key: Array, params: RewardParams) -> tuple[Array, RewardState]:
         obs, world = self.task.env.reset_env(key, self.task.params)
         nothing = jnp.zeros(len(self._augmented_keys), jnp.float32)
@@ -289,13 +229,19 @@ class RewardEnv(ProxyEnv):
         obs, world, real_reward, terminated, info = self.task.env.step_env(
             key, state.world, action, self.task.params
         )
-        next_state = RewardState(
-            world=world,
-            obs=obs,
-            augmentation=_select(info, self._augmented_keys),
-            time=state.time + 1,
-        )
-        reward = bonus = self.bonus(params, state, next_state, info, terminated)
+        vector = _select(info, self._augmented_keys)
+        next_state = RewardState(world=world, obs=obs, augmentation=vector, time=state.time + 1)
+        if self.config.shaping.weighs_info:
+            bonus = params.weights["info_weights"] @ _select(info, self.task.info_keys)
+        else:
+            bonus = self.potential(params, obs, vector)
+            if self.config.zero_at_terminal:
+                is_cut = self.is_truncated(next_state, params)
+                bonus = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, bonus)
+        if self.config.shaping.is_potential_based:
+            before = self.potential(params, state.obs, state.augmentation)
+            bonus = params.discount * bonus - before
+        reward = bonus
         if self.config.shaping.is_additive:
             reward = real_reward + bonus
         is_sane = jnp.isfinite(reward) & (jnp.abs(bonus) < MAX_ABS_VALUE)

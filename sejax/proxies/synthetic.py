@@ -18,22 +18,9 @@ from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.envs.spec import Box, TaskSpec
 from sejax.ops.networks import MLP
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    counts,
-    one_of,
-    option,
-    positive,
-    require,
-    shortened,
-)
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams
 
-DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
-INITIAL_STATES = ("real", "learned", "noise")
-STATE_UNITS = ("raw", "bounds")
-REWARD_FORMS = ("network", "distance", "quadratic")
 START_HIDDEN_SIZE = 32  # units of the network that makes initial states
 
 Vector = TypeVar("Vector", np.ndarray, Array)
@@ -91,42 +78,27 @@ class SyntheticConfig(ProxyConfig):
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    done: str = option("threshold", one_of(DONE_MODES))
+    done: str = option("threshold", one_of(("soft", "threshold", "bernoulli", "sigmoid")))
     min_steps: int = option(1, counts("an episode has steps"))
-    initial_state: str = option("learned", one_of(INITIAL_STATES))
-    state_units: str = option("raw", one_of(STATE_UNITS))
+    initial_state: str = option("learned", one_of(("real", "learned", "noise")))
+    state_units: str = option("raw", one_of(("raw", "bounds")))
     horizon: int | None = option(1, counts("an episode has steps"))
-    reward_form: str = option("network", one_of(REWARD_FORMS))
+    reward_form: str = option("network", one_of(("network", "distance", "quadratic")))
     reward_slope: float = option(1.0, positive("a reward must tell actions apart"))
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
     horizon_is_terminal: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.min_steps <= (self.horizon or self.min_steps),
-            "proxy.min_steps",
-            f"must be at most the horizon; got {self.min_steps} with a horizon of {self.horizon}. "
-            f"Set proxy.min_steps={self.horizon}, or proxy.horizon=null.",
-        )
-        require(
-            self.horizon != 1 or self.horizon_is_terminal,
-            "proxy.horizon_is_terminal",
-            "must be true with proxy.horizon=1, which has no next state; got false. Set "
-            "proxy.horizon_is_terminal=true.",
-        )
-        require(
-            self.is_bandit or self.reward_form == "network",
-            "proxy.reward_form",
-            f"must be network where episodes have several steps; got {self.reward_form}. Set "
-            "proxy.reward_form=network, or proxy.horizon=1.",
-        )
-        require(
-            self.reward_form != "network" or self.reward_slope == 1,
-            "proxy.reward_slope",
-            f"must be 1 with proxy.reward_form=network; got {self.reward_slope:g}. Set "
-            "proxy.reward_form=distance.",
-        )
+        horizon, is_network = self.horizon, self.reward_form == "network"
+        can_end = horizon is None or self.min_steps <= horizon
+        self._require(can_end, "min_steps", horizon, "or less, with a horizon of as many steps")
+        has_next = horizon != 1 or self.horizon_is_terminal
+        self._require(has_next, "horizon_is_terminal", True, "with proxy.horizon=1")
+        is_known = horizon == 1 or is_network
+        self._require(is_known, "reward_form", "network", "but with proxy.horizon=1")
+        has_slope = not is_network or self.reward_slope == 1
+        self._require(has_slope, "reward_slope", 1.0, "with proxy.reward_form=network")
 
     @property
     def is_bandit(self) -> bool:
@@ -152,12 +124,8 @@ class SyntheticConfig(ProxyConfig):
         Raises:
           ConfigError: if it is not.
         """
-        require(
-            self.reward_form == "network" or spec.num_actions is None,
-            "proxy.reward_form",
-            f"must be network for discrete actions, as of {shortened(task_name)}; got "
-            f"{self.reward_form}. Set proxy.reward_form=network.",
-        )
+        fits = self.reward_form == "network" or spec.num_actions is None
+        self._require(fits, "reward_form", "network", f"for discrete actions, as of {task_name}")
 
     @property
     def reaches_step_limit(self) -> bool:
@@ -174,9 +142,10 @@ class SyntheticConfig(ProxyConfig):
           {'reward': [6, 8, 1], 'start': [4, 32, 4]}
         """
         outputs = {"state": obs_dim, "reward": 1, "done": 1}
-        heads = ("reward",) if self.is_bandit else tuple(outputs)
+        if self.is_bandit:
+            outputs = {"reward": 1}
         hidden = [self.hidden_size] * self.num_layers
-        networks = {head: [action_dim + obs_dim, *hidden, outputs[head]] for head in heads}
+        networks = {head: [action_dim + obs_dim, *hidden, size] for head, size in outputs.items()}
         if self.reward_form != "network":
             networks["reward"] = [obs_dim, *hidden, action_dim]
         if self.initial_state == "learned":
@@ -198,9 +167,8 @@ class SyntheticConfig(ProxyConfig):
         low, high = (np.asarray(x, np.float32) for x in (space.low, space.high))
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
-        return Units(
-            middle=((low + high) / 2).astype(np.float32), one=((high - low) / 4).astype(np.float32)
-        )
+        middle, one = (low + high) / 2, (high - low) / 4
+        return Units(middle.astype(np.float32), one.astype(np.float32))
 
     def make(self, task: Task) -> "SyntheticEnv":
         """The SE of a task.
@@ -247,15 +215,10 @@ class SyntheticEnv(ProxyEnv):
     """
 
     config: SyntheticConfig
-    is_bandit = False
 
     def __init__(self, task: Task, config: SyntheticConfig):
         super().__init__(task, config)
-        self._nets = {
-            name: MLP(units[-1], units[1], len(units) - 2, config.activation)
-            for name, units in config.networks(task.obs_dim, task.action_dim).items()
-        }
-        self._start = self._nets.pop("start", None)
+        self._networks = config.networks(task.obs_dim, task.action_dim)
         self._units = None
         if isinstance(task.observation, Box):
             self._units = config.units(task.observation)
@@ -264,33 +227,34 @@ class SyntheticEnv(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
-        units = self.config.networks(self.task.obs_dim, self.task.action_dim)
-        *keys, key_start = jax.random.split(key, len(self._nets) + 1)
-        weights: dict[str, Any] = {
-            head: net.init(k, jnp.zeros(units[head][0]))["params"]
-            for k, (head, net) in zip(keys, self._nets.items(), strict=True)
+        keys = jax.random.split(key, len(self._networks.keys() | {"start"}))
+        return {
+            name: self._net(name).init(network_key, jnp.zeros(units[0]))["params"]
+            for network_key, (name, units) in zip(keys, self._networks.items(), strict=False)
         }
-        if self._start is not None:
-            noise = jnp.zeros(self.task.obs_dim)
-            weights["start"] = self._start.init(key_start, noise)["params"]
-        return weights
+
+    def _net(self, name: str) -> MLP:
+        _, size, *_, num_outputs = units = self._networks[name]
+        return MLP(num_outputs, size, len(units) - 2, self.config.activation)
+
+    def _apply(self, weights: PyTree, name: str, inputs: Array) -> Any:
+        return self._net(name).apply({"params": weights[name]}, inputs)
 
     def predict(
         self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The networks' raw outputs: next state, reward and done output d."""
-        out = self._outputs(weights, vector, action)
-        state = out["state"] if self._units is None else self._units.decode(out["state"])
-        return state, out["reward"][0], out["done"][0]
+        inputs = self._inputs(vector, action)
+        state, reward, done = (
+            self._apply(weights, name, inputs) for name in ("state", "reward", "done")
+        )
+        return state if self._units is None else self._units.decode(state), reward[0], done[0]
 
-    def _outputs(
-        self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
-    ) -> dict[str, Any]:
-        """The output of each network, `[size]`, in the networks' own units."""
+    def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
+        """What the networks of a step see: the action, then the state in their units."""
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        x = jnp.concatenate([action, self._seen(vector)])
-        return {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
+        return jnp.concatenate([action, self._seen(vector)])
 
     def _seen(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
         """A state in the networks' own units."""
@@ -303,9 +267,8 @@ class SyntheticEnv(ProxyEnv):
                 vector = jax.nn.one_hot(vector, self.task.num_states)
         else:
             vector = noise = jax.random.normal(key, (self.task.obs_dim,))
-            if self._start is not None:
-                moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
-                vector = noise + moved
+            if self.config.initial_state == "learned":
+                vector = noise + self._apply(params.weights, "start", noise)
             vector = vector if self._units is None else self._units.decode(vector)
             # At the limit, and not beyond it: the first step from there ends the episode.
             vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
@@ -371,24 +334,17 @@ class BanditEnv(SyntheticEnv):
     Source: forms of the reward: ours.
     """
 
-    is_bandit = True
-
     def predict(
         self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The state as it is, the network's reward, and 1."""
         if self.config.reward_form == "network":
-            return vector, self._outputs(weights, vector, action)["reward"][0], jnp.float32(1)
-        apart = action - self._best_action(weights, vector)
+            reward = self._apply(weights, "reward", self._inputs(vector, action))
+            return vector, reward[0], jnp.float32(1)
+        best = self._apply(weights, "reward", self._seen(vector))
+        apart = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
         cost = jnp.abs(apart) if self.config.reward_form == "distance" else apart**2
         return vector, -self.config.reward_slope * cost.sum(), jnp.float32(1)
-
-    def _best_action(
-        self, weights: PyTree, vector: Float[Array, " obs_dim"]
-    ) -> Float[Array, " action_dim"]:
-        """What the network of a reward of known form makes: the best action of a state."""
-        output: Any = self._nets["reward"].apply({"params": weights["reward"]}, self._seen(vector))
-        return self.task.max_action * jnp.clip(output, -1.0, 1.0)
 
     def bandit_reward(
         self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array

@@ -4,19 +4,19 @@ All of it reads a file's header without JAX. `tools/ship_proxy.py` writes the sh
 `tools/make_zoo.py` makes `docs/zoo.md` of them.
 """
 
-import itertools
+import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
-from sejax.options import as_text, is_number
-from sejax.options.plain import from_plain, to_plain
+from sejax.options import as_text, is_number, require, shortened
+from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
 CARD = Path(__file__).with_name("card.md")
+_GYM = "env = sejax.gym.make({})  # a gymnasium.Env, in NumPy: any agent\n"
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
 
 
@@ -139,13 +139,9 @@ class Zoo(tuple[PretrainedProxy, ...]):
     """Proxies, which print as a table."""
 
     def __repr__(self) -> str:
-        rows = [proxy.row for proxy in self]
-        table = [list(rows[0]), *(list(row.values()) for row in rows)] if rows else []
+        table = [[*self[0].row], *([*proxy.row.values()] for proxy in self)] if self else []
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = (
-            "  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)) for row in table
-        )
-        return "\n".join(map(str.rstrip, lines))
+        return "\n".join("  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table)
 
 
 def pretrained() -> Zoo:
@@ -169,24 +165,23 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     Raises:
       ConfigError: for an evaluation or a learning of another shape.
     """
-    path, _, of_file = stored
-    record, config = of_file.proxies[0], of_file.config
-    names = ("scores", "generation", "seed", "evaluations", "learning", "policy_return")
-    known = {name: record[name] for name in names if record.get(name) is not None}
+    path, _, learned = stored
+    record, config = learned.proxies[0], learned.config
+    names = [name for name in fields_of(PretrainedProxy) if record.get(name) is not None]
+    values = {name: record[name] for name in names}
     if "score" in record:
-        agents = header.agents_of(config)
-        known.setdefault("scores", dict.fromkeys(agents, float(record["score"])))
-    if isinstance(config.get("objective"), Mapping):
-        known["objective"] = config["objective"].get("name", "")
-    values = {
+        scores = dict.fromkeys(header.agents_of(config), float(record["score"]))
+        values.setdefault("scores", scores)
+    objective = config.get("objective")
+    values |= {
         "name": name or path.stem,
-        "kind": of_file.kind,
-        "task": of_file.task,
+        "kind": learned.kind,
+        "task": learned.task,
         "settings": config["proxy"],
         "size_kb": path.stat().st_size / 1000,
+        "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
     }
-    described: PretrainedProxy = from_plain(PretrainedProxy, values | known, "record")
-    return described
+    return from_plain(PretrainedProxy, values, "record")
 
 
 def spread(values: Sequence[float], spec: str) -> str:
@@ -196,65 +191,62 @@ def spread(values: Sequence[float], spec: str) -> str:
       >>> spread([199.5, 180.0], ".1f"), spread([4000.0, 4000.2], ",.0f")
       ('180.0 to 199.5', '4,000')
     """
-    ends = [format(end(values), spec) for end in (min, max)] if values else []
-    return " to ".join(text for text, _ in itertools.groupby(ends))
+    ends = (min(values), max(values)) if values else ()
+    return " to ".join(dict.fromkeys(format(end, spec) for end in ends))
 
 
 # --- model cards ----------------------------------------------------------------------------------
 
-_ABOUT = {
-    "se": "A synthetic environment (SE) for the task `{task}`: small networks make its states and "
-    "rewards. Agents train on it alone, without a step of the real task, and are then used there. "
-    "Its states and rewards need not be like the real ones.",
-    "rn": "A reward network (RN) for the task `{task}`: the dynamics are the real task's, and a "
-    "small network makes the reward, so that agents like those it was learned with need fewer real "
-    "steps. It may not help other agents, or may harm them.",
+_KINDS = {"se": ["synthetic-environment"], "rn": ["reward-network"], "other": []}  # with tags
+_ROW = (  # of an evaluation
+    "| {0.agent} | {0.hparams} | {0.world} | {0.return_mean:.1f} ± {0.return_std:.1f} | "
+    "{0.train_steps:,.0f} | {0.num_agents} |"
+)
+_BEST = {  # overrides of `sejax.evaluate` that train agents again as they were
+    "default": " agent={}",
+    "varied": " agent={} agent_hparams=varied",
+    "as_learned": " agent_hparams=as_learned",
 }
-_ABOUT_OTHER = "A proxy for the task `{task}`, of its author's own kind `{kind}`."
 
 
 def card_of(
-    proxy: PretrainedProxy,
-    source: str,
-    needs: Sequence[str] = (),
-    license_text: str = SHIPPED_LICENSE,
+    proxy: PretrainedProxy, source: str, needs: Sequence[str] = (), license: str = ""
 ) -> str:
-    """A proxy's model card, `card.md` with its values; sections of what is not known are left out.
+    """A proxy's model card: `card.md` with its values, without the parts that have none.
 
     Args:
       proxy: what its file tells.
-      source: what `sejax.load` takes.
+      source: what `sejax.load` takes; with the front matter that the Hub reads, if it is there.
       needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
         file's names are never imported.
-      license_text: a sentence, or the license's name.
+      license: its name; that of the shipped proxies if it is empty.
     """
-    arguments = "".join(f", {header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)
+    kind = proxy.kind if proxy.kind in _KINDS else "other"
+    call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
-    call = f'("{source}"{arguments})'
-    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent\n"
-    values = {
-        "name": proxy.name,
-        "about": _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind),
-        "facts": table([{"field": key, "value": text} for key, text in _facts(proxy).items()]),
-        "evaluations": table([*map(_cells, proxy.evaluations)]),
-        "command": proxy.learning.command if proxy.learning else "",
+    best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
+    tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
+    values = vars(proxy) | {
+        "front": json.dumps(license) if hub.is_address(source) else None,
+        "tags": json.dumps(tags),
+        **{name: "" if name == kind else None for name in _KINDS},
+        "facts": table([{"field": name, "value": text} for name, text in _facts(proxy).items()]),
+        "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
+        "command": proxy.learning and proxy.learning.command,
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
-        "gym": gym if proxy.kind == "se" else "",
+        "gym": _GYM.format(call) if kind == "se" else "",
         "call": call,
         "source": source,
-        "overrides": words + _words_of_best(proxy),
-        "license": license_text,
+        "overrides": words + (_BEST[best.hparams].format(best.agent) if best else ""),
+        "license": license or SHIPPED_LICENSE,
     }
-    unknown = [f"{{{name}}}" for name in ("evaluations", "command") if not values[name]]
-    sections = CARD.read_text(encoding="utf-8").rstrip().split("\n\n## ")
-    kept = [text for text in sections if not any(field in text for field in unknown)]
-    return "\n\n## ".join(kept).format(**values)
+    parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
+    kept = [x for x in parts if None not in map(values.get, re.findall(r"\{(\w+)\}", x))]
+    return "\n\n".join(kept).format(**values)
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
-    """A table in Markdown, of rows by the names of their columns; empty without rows."""
-    if not rows:
-        return ""
+    """A table in Markdown, of rows by the names of their columns."""
     lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -279,32 +271,7 @@ def _text(value: object) -> str:
     return "" if value is None else as_text(value)
 
 
-def _cells(evaluation: Evaluation) -> dict[str, str]:
-    """An evaluation's row in a card."""
-    return {
-        "agent": evaluation.agent,
-        "hyperparameters": evaluation.hparams,
-        "trained on": evaluation.world,
-        "return": f"{evaluation.return_mean:.1f} ± {evaluation.return_std:.1f}",
-        "training steps": f"{evaluation.train_steps:,.0f}",
-        "agents": str(evaluation.num_agents),
-    }
-
-
-def _words_of_best(proxy: PretrainedProxy) -> str:
-    """Overrides of `sejax.evaluate` that train the agents which learned best."""
-    best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
-    if best is None:
-        return ""
-    if best.hparams == "as_learned":
-        return " agent_hparams=as_learned"
-    varied = " agent_hparams=varied" if best.hparams == "varied" else ""
-    return f" agent={best.agent}{varied}"
-
-
 # --- sharing --------------------------------------------------------------------------------------
-
-_TAGS = {"se": ["synthetic-environment"], "rn": ["reward-network"]}
 
 
 def push(
@@ -333,24 +300,11 @@ def push(
     Raises:
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
-    hub.require_repo(repo)
+    require(hub.is_repo(repo), "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
     stored = header.read(source, single=True)
-    proxy = describe(stored, name=repo.rpartition("/")[2])
-    config = stored.header.config
+    config, address = stored.header.config, f"{hub.SCHEME}{repo}"
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
-    address = f"{hub.SCHEME}{repo}"
-    card = _front_matter(proxy, license) + card_of(proxy, address, needs, license)
+    card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
     files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
     hub.upload(repo, files, message, private)
     return address
-
-
-def _front_matter(proxy: PretrainedProxy, license: str) -> str:
-    """What the Hub itself reads of a card, in YAML."""
-    values: Mapping[str, Any] = {
-        "library_name": "sejax",
-        "license": license,
-        "pipeline_tag": "reinforcement-learning",
-        "tags": ["reinforcement-learning", "jax", *_TAGS.get(proxy.kind, []), proxy.task],
-    }
-    return f"---\n{yaml.safe_dump(values, sort_keys=False)}---\n\n"
