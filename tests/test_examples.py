@@ -157,7 +157,7 @@ def test_a_sac_update_is_sejaxs(examples):
     state = own_agent.SACState(
         params=params, target_critics=target_critics, opt_state=own_agent.ADAM.init(params),
         is_warming_up=np.bool_(False),
-        hparams=sejax.agents.traced(own_agent.SAC(**options), own_agent.SACHparams),
+        hparams=sejax.agents.traced(own_agent.SAC(**options)),
     )  # fmt: skip
     rng = np.random.default_rng(0)
     arrays = {
@@ -174,15 +174,14 @@ def test_a_sac_update_is_sejaxs(examples):
 
     config = sejax.SACConfig(**options, num_layers=2, activation="relu", learning_rate=1e-3,
                              alpha=None, target_entropy=-1.0)  # fmt: skip
-    policy = sac.gaussian_policy(ACTION_DIM, 1.0)
-    agent = sac.make_sac(config, OBS_DIM, policy)
-    learn = sac.make_learning_step(sac.make_networks(config, OBS_DIM, policy), policy)
+    learner = sac.SAC(config, OBS_DIM, ACTION_DIM)
+    agent = learner.agent()
     expected = shapes_of(agent.init, jax.random.key(0), agent.hparams).replace(
         params=flat(**params), hparams=agent.hparams,
         target_critics=flat(None, target_critics, [])
     )  # fmt: skip
     columns = sac.LearningNoise(action=noise[0].T, next_action=noise[1].T)
-    expected = jax.jit(learn)(expected, jax.tree.map(np.transpose, batch), columns)
+    expected = jax.jit(learner.learn)(expected, jax.tree.map(np.transpose, batch), columns)
     moments = flat(**after.opt_state.mu)  # after the first step a tenth of the gradient
     moments[-1] /= np.exp(params["log_alpha"])  # the temperature's loss: alpha, there its logarithm
     np.testing.assert_allclose(moments, expected.opt_state.mu, rtol=1e-4, atol=1e-6)

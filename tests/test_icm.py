@@ -107,7 +107,7 @@ def initial(kind):
     """A fresh state with the parameters that torch started from; nothing is compiled."""
     agent = curious(kind)
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
-    hparams = jax.tree.map(np.float32, agent.hparams.icm)
+    hparams = jax.tree.map(np.float32, agent.hparams.replace(agent=None))
     return state.replace(params=np.load(GOLDEN)[f"{kind}/params/0"], hparams=hparams)
 
 
@@ -115,7 +115,7 @@ def fresh(kind, **hparams):
     """A wrapped stub with these hyperparameters."""
     state = initial(kind)
     numbers = {name: np.float32(x) for name, x in hparams.items()}
-    return state.replace(hparams=state.hparams._replace(**numbers))
+    return state.replace(hparams=state.hparams.replace(**numbers))
 
 
 def bonus(state, batch):
@@ -158,7 +158,7 @@ def test_the_bonus_shrinks_for_what_is_seen_often_and_is_larger_for_the_unseen(u
     first = bonus(update(KEY, state, seen), seen)
     state = update(KEY, state, seen, 300)
     last = bonus(state, seen)
-    frozen = state.replace(hparams=state.hparams._replace(learning_rate=np.float32(0)))
+    frozen = state.replace(hparams=state.hparams.replace(learning_rate=np.float32(0)))
     strange = bonus(update(KEY, frozen, unseen), unseen)
     assert last.mean() < 0.1 * first.mean()
     assert strange.mean() > 10 * last.mean()
@@ -183,7 +183,7 @@ def test_hyperparameters_are_traced_so_that_a_population_may_vary_them():
     start = initial("index")
 
     def shown(scale, rate):
-        hparams = start.hparams._replace(reward_scale=scale, learning_rate=rate)
+        hparams = start.hparams.replace(reward_scale=scale, learning_rate=rate)
         after = agent.update(KEY, start.replace(hparams=hparams), batch)
         return after.agent_state.batch.reward - batch.reward, after.params - start.params
 
@@ -229,8 +229,8 @@ def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kin
 
 def test_a_fresh_module_has_the_configured_numbers():
     agent = curious("index")
-    assert agent.hparams == ((), (0.01, 0.3, 0.5))
-    assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
+    expected = {"learning_rate": 0.01, "forward_weight": 0.3, "reward_scale": 0.5, "agent": ()}
+    assert vars(agent.hparams) == expected
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     np.testing.assert_allclose(state.params, initial("index").params, rtol=1e-5, atol=1e-7)
 

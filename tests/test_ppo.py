@@ -23,16 +23,14 @@ from support import (
 )
 
 from sejax.agents import buffers
-from sejax.agents.base import traced
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.policies import gaussian, softmax
 from sejax.agents.ppo import (
     MIN_STD,
+    PPO,
+    ContinuousPPO,
     PPOConfig,
-    PPOHparams,
-    make_ppo,
+    bounded_exp,
     normalized,
-    ppo_loss,
     shuffled,
 )
 from sejax.ops.networks import MLP
@@ -46,7 +44,6 @@ CONFIG = PPOConfig.paper(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
-HPARAMS = traced(CONFIG, PPOHparams)
 # Three minibatches of four steps, so that each epoch leaves one out.
 GAE = dataclasses.replace(
     CONFIG, advantages="gae", gae_lambda=0.8, rollout_steps=STEPS, num_minibatches=3,
@@ -59,9 +56,11 @@ KEY = jax.random.key(0)
 
 @functools.cache
 def ppo(kind, config=None):
-    is_continuous = kind == "continuous"
-    policy = gaussian(ACTION_DIM, MAX_ACTION) if is_continuous else softmax(NUM_ACTIONS)
-    return make_ppo(config or CONFIGS[kind], OBS_DIM, policy, MAX_STEPS)
+    config = config or CONFIGS[kind]
+    length = config.rollout_length(MAX_STEPS)
+    if kind == "continuous":
+        return ContinuousPPO(config, OBS_DIM, ACTION_DIM, length, max_action=MAX_ACTION).agent()
+    return PPO(config, OBS_DIM, NUM_ACTIONS, length).agent()
 
 
 def networks(kind, config=CONFIG):
@@ -158,9 +157,8 @@ def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
     @jax.jit
     @jax.value_and_grad
     def loss(log_prob):
-        values = jnp.array([3.0, -3.0])
-        zeros = jnp.zeros(2)
-        return ppo_loss(log_prob, values, values, zeros, -values, zeros, HPARAMS)
+        ratio, advantage = bounded_exp(log_prob), jnp.array([3.0, -3.0])
+        return jnp.minimum(ratio * advantage, jnp.clip(ratio, 0.8, 1.2) * advantage).mean()
 
     for log_ratio in (1e5, -1e5):
         value, gradient = loss(np.full(2, log_ratio, np.float32))
@@ -225,7 +223,7 @@ def test_the_std_stops_at_its_floor_and_can_grow_again():
     _, _, unravel = networks("continuous")
 
     def learn(state, entropy_weight):
-        hparams = state.hparams._replace(entropy_weight=np.float32(entropy_weight),
+        hparams = state.hparams.replace(entropy_weight=np.float32(entropy_weight),
                                          learning_rate=np.float32(0.05))  # fmt: skip
         return update_of(agent)(KEY, state.replace(hparams=hparams), rollout("continuous"))
 
@@ -347,7 +345,7 @@ BANDIT = PPOConfig(
 def test_the_critic_bootstraps_with_each_transitions_own_discount():
     # A reward of 1 in each step of episodes of four, with gamma = 0.8: V = 1 / (1 - 0.8 d), which
     # is 1 where episodes terminate with each step, 5 where they are truncated after four.
-    agent = make_ppo(BANDIT, obs_dim=1, policy=softmax(2), max_steps=4)
+    agent = PPO(BANDIT, obs_dim=1, action_dim=2, length=64).agent()
     obs, ones = np.ones((64, 1), np.float32), jnp.ones(64)
 
     @jax.jit

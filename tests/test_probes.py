@@ -58,7 +58,7 @@ ACTOR_CRITIC = OFF_POLICY | {
 AGENTS = {
     "ddqn": sejax.DDQNConfig(**OFF_POLICY),
     "dueling_ddqn": sejax.DuelingDDQNConfig(**OFF_POLICY, feature_dim=16, stream_hidden_size=16),
-    "dqn": sejax.DQNConfig(**OFF_POLICY, train_every=2, gradient_steps=2),
+    "dqn": sejax.DQNConfig(**OFF_POLICY),
     "td3": sejax.TD3Config(**ACTOR_CRITIC),
     "td3_discrete": sejax.DiscreteTD3Config(
         **OFF_POLICY, target_noise_std=0.0, final_temperature=1.0

@@ -10,7 +10,7 @@ from support import assert_shares, drawing, paper_training
 
 from sejax import envs
 from sejax.agents.buffers import Transition
-from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, Tabular
 from sejax.evaluation import make_tester
 from sejax.training import make_trainer
 
@@ -21,7 +21,7 @@ NUMBERS = {"learning_rate": 0.5, "discount": 0.9, "epsilon_init": 0.4, "epsilon_
 
 @functools.cache
 def q_learning(num_states=NUM_STATES, num_actions=NUM_ACTIONS, config=QLearningConfig, **numbers):
-    return make_tabular(config(**{**NUMBERS, **numbers}), num_states, num_actions)
+    return Tabular(config(**{**NUMBERS, **numbers}), num_states, num_actions).agent()
 
 
 sarsa = functools.partial(q_learning, config=SARSAConfig)
@@ -199,7 +199,7 @@ def trained(agent, task, num_episodes, num_agents):
 
 def test_q_learning_finds_the_shortest_way_along_the_cliff_and_never_undervalues():
     task = envs.make("cliff_walking")  # with the paper's numbers
-    agent = make_tabular(QLearningConfig(), task.num_states, task.num_actions)
+    agent = Tabular(QLearningConfig(), task.num_states, task.num_actions).agent()
     result, returns = trained(agent, task, num_episodes=300, num_agents=6)
     np.testing.assert_array_equal(returns, -12.0)  # 13 steps, the last of which is free
     assert not result.nonfinite.any()

@@ -12,17 +12,13 @@ from support import drawing, numpy_forward, random_columns, raveled, shapes_of, 
 
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
+    TD3,
+    DiscreteTD3,
     DiscreteTD3Config,
     LearningNoise,
     TD3Config,
     annealed_temperature,
-    draw_learning_noise,
     gumbel_softmax,
-    gumbel_softmax_policy,
-    make_learning_step,
-    make_networks,
-    make_td3,
-    tanh_policy,
 )
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
@@ -53,15 +49,16 @@ def is_discrete(config):
     return isinstance(config, DiscreteTD3Config)
 
 
-def policy_of(config):
+@functools.cache
+def td3_of(config):
     if is_discrete(config):
-        return gumbel_softmax_policy(ACTION_DIM, config.temperature_steps, config.one_hot_actions)
-    return tanh_policy(ACTION_DIM, MAX_ACTION)
+        return DiscreteTD3(config, OBS_DIM, ACTION_DIM, 1.0)
+    return TD3(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
 
 
 @functools.cache
 def agent_of(config):
-    return make_td3(config, OBS_DIM, policy_of(config))
+    return td3_of(config).agent()
 
 
 @functools.cache
@@ -81,8 +78,7 @@ def state_with(config, params):
 @functools.cache
 def learn_of(config):
     """The jitted learning step, `(state, batch, noise) -> state`."""
-    networks = make_networks(config, OBS_DIM, ACTION_DIM)
-    return jax.jit(make_learning_step(config, networks, policy_of(config)))
+    return jax.jit(td3_of(config).learn)
 
 
 def case_batch(config, seed):
@@ -167,14 +163,14 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
     n = 20_000
-    noise = draw_learning_noise(jax.random.key(0), policy_of(DISCRETE), (1, n))
+    noise = td3_of(DISCRETE).draw_noise(jax.random.key(0), (1, n))
     x = np.concatenate(noise)  # [3, n]
     # Standard Gumbel: mean 0.5772, variance pi^2 / 6.
     variance = np.array([1.0, np.pi**2 / 6, np.pi**2 / 6])
     assert (np.abs(x.mean(1) - [0.0, 0.57722, 0.57722]) < 5 * np.sqrt(variance / n)).all()
     np.testing.assert_allclose(x.var(1), variance, rtol=0.1)
     assert np.abs(np.corrcoef(x)[np.triu_indices(3, 1)]).max() < 5 / np.sqrt(n)
-    assert draw_learning_noise(jax.random.key(0), policy_of(CONFIG), (1, 2)).policy is None
+    assert td3_of(CONFIG).draw_noise(jax.random.key(0), (1, 2)).policy is None
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
@@ -197,7 +193,7 @@ def test_gumbel_softmax_by_hand():
 
 
 def test_a_final_temperature_of_zero_gives_finite_samples_and_gradients():
-    hparams = agent_of(DISCRETE).hparams._replace(final_temperature=0.0)
+    hparams = agent_of(DISCRETE).hparams.replace(final_temperature=0.0)
     gumbel, weights = np.float32([-2.0, 17.0, 0.0]), np.float32([1.0, 2.0, 3.0])
 
     @jax.jit
@@ -227,7 +223,7 @@ def acting_state_of(config):
 def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
     """Actions of 4000 keys, `[4000, action_dim]`."""
     state, agent = acting_state_of(config), agent_of(config)
-    hparams = state.hparams._replace(action_noise_std=np.float32(action_noise_std))
+    hparams = state.hparams.replace(action_noise_std=np.float32(action_noise_std))
     state = agent.begin_episode(state.replace(hparams=hparams), np.int32(2 if warming_up else 3))
     return np.asarray(drawing(agent)(state, OBS)[0 if explore else 1])
 
@@ -317,8 +313,8 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
         hidden_size=16, num_layers=2, learning_rate=0.003, tau=0.1, discount=0.8,
         target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
     )  # fmt: skip
-    agent = make_td3(config, 2, gumbel_softmax_policy(2, config.temperature_steps, one_hot))
-    networks = make_networks(config, 2, 2)
+    td3 = DiscreteTD3(config, 2, 2, 1.0)
+    agent = td3.agent()
     gumbel = np.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
     taken, in_a = np.argmax(gumbel, axis=0), np.arange(64) % 2 == 0
     waits = in_a & (taken == 1)
@@ -336,7 +332,7 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
         state = train_on(agent, batch, 1000)
         actions = [agent.env_action(agent.act(key, state, obs, explore=False)) for obs in states.T]
         pairs = np.repeat(states, 2, axis=1), np.tile(np.eye(2, dtype=np.float32), 2)
-        return actions, [networks.critic(critic, *pairs) for critic in state.critics]
+        return actions, [td3.q_value(critic, *pairs) for critic in state.critics]
 
     actions, q_values = run(jax.random.key(0))
     assert [int(action) for action in actions] == [1, 0]

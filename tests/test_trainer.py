@@ -17,7 +17,7 @@ from support import assert_close, paper_se, paper_training
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
-from sejax.agents.dqn import DDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.envs.wrappers import PartlyScored, PartParams
 from sejax.evaluation import make_recorder, make_tester
@@ -399,7 +399,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
 def test_a_time_limit_is_never_terminal_in_an_se():
     """As programs; what they do on a real task is above."""
     env = paper_se(hidden_size=4).make(envs.make("cartpole"))
-    agent = make_ddqn(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4), 4, 2)
+    agent = DDQN(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4), 4, 2).agent()
     trainings = [training(stop_rule="never", time_limit_is_terminal=x) for x in (False, True)]
     without, asked = (
         re.sub("0x[0-9a-f]+", "", str(jax.make_jaxpr(train)(KEY, env.default_params)))
@@ -413,7 +413,7 @@ def test_a_time_limit_is_never_terminal_in_an_se():
 
 def test_the_tester_equals_greedy_episodes_in_gymnasium():
     task = envs.make("cartpole")
-    agent = make_ddqn(DDQNConfig(hidden_size=8, num_layers=1), 4, 2)
+    agent = DDQN(DDQNConfig(hidden_size=8, num_layers=1), 4, 2).agent()
     state = agent.init(jax.random.key(2), agent.hparams)
     key = jax.random.key(3)
     returns, steps, _ = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)

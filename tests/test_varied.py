@@ -16,7 +16,7 @@ from sejax import envs
 from sejax.agents import make_agent
 from sejax.agents.base import Agent, Draw, Varied, drawing_key
 from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
-from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
@@ -115,7 +115,7 @@ def random_batch(num_columns, seed):
 @pytest.mark.parametrize("kind", ["ddqn", "dueling"])
 def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(kind):
     configs = [configured(kind, SMALL, NUM_COLUMNS), configured(kind, LARGE, BATCH)]
-    small, large = (make_ddqn(config, OBS_DIM, NUM_ACTIONS) for config in configs)
+    small, large = (DDQN(config, OBS_DIM, NUM_ACTIONS).agent() for config in configs)
     templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
 
     @jax.jit
@@ -125,7 +125,7 @@ def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(ki
         return ravel_pytree(embed(unravel_small(params), templates[1]))[0]
 
     state = jax.jit(small.init)(jax.random.key(0), small.hparams)
-    hparams = large.hparams._replace(hidden_size=jnp.float32(SMALL),
+    hparams = large.hparams.replace(hidden_size=jnp.float32(SMALL),
                                      batch_size=jnp.float32(NUM_COLUMNS))  # fmt: skip
     wide = jax.jit(large.init)(jax.random.key(0), hparams)
     params = widened(state.params)
@@ -198,9 +198,9 @@ def sums_of_columns(batch, batch_size):
     return sum_over_batch(total, batch, batch_size), sum_over_batch(total, batch, None)
 
 
-@pytest.mark.parametrize("batch_size", [1, block_size(100), block_size(100) + 1, 100])
+@pytest.mark.parametrize("batch_size", [1, block_size(128), block_size(128) + 1, 128])
 def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
-    values = np.arange(100.0, dtype=np.float32)
+    values = np.arange(128.0, dtype=np.float32)
     batch = {"x": np.stack([values, 2 * values]), "weight": values < batch_size, "scale": 3.0}
     expected = 3 * np.arange(batch_size).sum() * np.array([1.0, 2.0])
     blockwise, at_once = sums_of_columns(batch, np.float32(batch_size))
@@ -243,7 +243,7 @@ def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_training
         lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key))
     )(key)
     assert drawn.values == values
-    hparams = drawn.hparams._asdict()
+    hparams = vars(drawn.hparams)
     for name in ("learning_rate", "batch_size", "hidden_size"):
         assert hparams.pop(name) == values[name]
     assert hparams.pop("discount") == 0.9  # what is not varied stays as it was configured
@@ -258,8 +258,8 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     (variant,) = varied.varied.agents
     drawn = jax.jit(varied.varied.draw)(jax.random.key(0))
     assert drawn.variant == 0
-    expected = variant.hparams.agent._replace(**drawn.values)
-    assert drawn.hparams == variant.hparams._replace(agent=expected)
+    expected = variant.hparams.agent.replace(**drawn.values)
+    assert drawn.hparams == variant.hparams.replace(agent=expected)
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
