@@ -234,17 +234,6 @@ def make_trainer(
       >>> result.returns.shape
       (8, 20)
     """
-    _require_parts(agent, env, training)
-    if training.num_tests_between and test_fn is None:
-        raise ValueError(
-            f"tests after each episode (training.num_tests_between is "
-            f"{training.num_tests_between}) need a test_fn; got None."
-        )
-    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
-
-
-def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> None:
-    """Checks that the arguments are what they are called, in their order."""
     require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
     fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
     must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
@@ -259,6 +248,12 @@ def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> 
     )
     require_part("training", TrainingConfig, training)
     require_modes()
+    if training.num_tests_between and test_fn is None:
+        raise ValueError(
+            f"tests after each episode (training.num_tests_between is "
+            f"{training.num_tests_between}) need a test_fn; got None."
+        )
+    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
 
 
 class _Loop:
@@ -292,7 +287,7 @@ class _Loop:
         self,
         key: Array,
         env_params: PyTree,
-        hparams: Hparams = None,
+        hparams: Hparams | None = None,
         active: Array | bool = True,
     ) -> TrainResult:
         """One training; `hparams` None are the agent's own."""

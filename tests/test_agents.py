@@ -43,9 +43,9 @@ EXPLORING = [
     ("ppo", "cartpole", "icm"),
     ("sarsa", "gridworld_2x2", "count_based"),
 ]
-JITTED = [("ddqn", "cartpole", "none"), ("ppo", "pendulum", "none"), EXPLORING[3]]
 every_agent = pytest.mark.parametrize("case", [*PLAIN, *EXPLORING], ids="-".join)
-OFF_POLICY = [case for case in PLAIN if case[0] not in ("ppo", "q_learning", "sarsa")]
+# DQN is DDQN with another target.
+OFF_POLICY = [case for case in PLAIN if case[0] not in ("dqn", "ppo", "q_learning", "sarsa")]
 every_off_policy_agent = pytest.mark.parametrize("case", OFF_POLICY, ids="-".join)
 
 
@@ -163,16 +163,6 @@ def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alon
     assert moved(*alone)
 
 
-@pytest.mark.parametrize("case", JITTED, ids="-".join)
-def test_an_update_that_is_jitted_is_the_same_as_one_that_is_not(case):
-    _, agent, _ = parts(case)
-    state, batch = started(case)
-    key = jax.random.key(3)
-    jitted = update_of(case)(key, state, batch)
-    assert moved(jitted, state)
-    assert_close(jitted, agent.update(key, state, batch), rtol=1e-3, atol=1e-5)
-
-
 @every_agent
 def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
     task, agent, _ = parts(case)
@@ -189,7 +179,7 @@ def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
         assert_equal(masked, batch)
 
 
-@pytest.mark.parametrize("case", EXPLORING, ids="-".join)
+@pytest.mark.parametrize("case", EXPLORING[::3], ids="-".join)
 def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
     task, agent, _ = parts(case)
     plain = parts((*case[:2], "none"))[1]
@@ -232,18 +222,6 @@ def test_columns_of_no_weight_change_nothing(case):
     assert_close(update(key, state, batch), update(key, state, other), rtol=1e-5, atol=1e-7)
     all_count = batch._replace(weight=jnp.ones_like(batch.weight))
     assert moved(update(key, state, batch), update(key, state, all_count))
-
-
-@every_off_policy_agent
-def test_a_transition_with_discount_zero_ignores_its_next_state(case):
-    state, batch = started(case)
-    update, key = update_of(case), jax.random.key(0)
-    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
-    assert moved(update(key, state, batch), update(key, state, elsewhere))
-    last, last_elsewhere = (
-        x._replace(discount=jnp.zeros_like(x.discount)) for x in (batch, elsewhere)
-    )
-    assert_equal(update(key, state, last), update(key, state, last_elsewhere))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""sejax.agents.dqn: updates against torch, exploration, and a probe MDP."""
+"""sejax.agents.dqn: updates against torch, and exploration."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +12,11 @@ from support import (
     numpy_forward,
     random_columns,
     shapes_of,
-    train_on,
     unraveled,
 )
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
-from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
@@ -134,31 +132,3 @@ def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise():
     best = np.argmax(numpy_forward(params, obs, CONFIG.activation, CONFIG.num_layers))
     assert (tested == best).all()
     assert_shares(drawn, 0.1 + 0.7 * np.eye(3)[best])  # random ones are uniform
-
-
-# --- probe ---------------------------------------------------------------------------------------
-
-
-def test_a_two_step_probe_learns_gamma_and_one():
-    # A -> B with reward 0, B -> end with reward 1, whatever the action. Hence Q(B) = 1, as nothing
-    # follows, and Q(A) = 0 + gamma * Q(B) = gamma. The end looks like A: bootstrapping there
-    # would be seen.
-    gamma = 0.7
-    config = replace(
-        CONFIG, hidden_size=8, num_layers=1, learning_rate=0.02, discount=gamma, activation="tanh"
-    )
-    agent = DDQN(config, obs_dim=2, num_actions=2).agent()
-    a, b = [1.0, 0.0], [0.0, 1.0]
-    batch = Transition(
-        obs=np.float32([a, a, b, b]).T,
-        action=np.int32([0, 1, 0, 1]),
-        reward=np.float32([0.0, 0.0, 1.0, 1.0]),
-        discount=np.float32([1.0, 1.0, 0.0, 0.0]),
-        next_obs=np.float32([b, b, a, a]).T,
-    )
-    learned = jax.jit(lambda: train_on(agent, batch, 600).params)
-    template = shapes_of(MLP(2, 8, 1, "tanh").init, jax.random.key(0), np.zeros(2))
-    params = unraveled(learned(), template)["params"]
-    for state, value in ((a, gamma), (b, 1.0)):
-        q_values = numpy_forward(params, state, "tanh", 1)
-        np.testing.assert_allclose(q_values, [value, value], atol=0.02)

@@ -1,4 +1,4 @@
-"""sejax.agents.sac: updates against torch, a density by hand, acting, probe MDPs."""
+"""sejax.agents.sac: updates against torch, a density by hand, acting."""
 
 import functools
 from dataclasses import replace
@@ -14,7 +14,6 @@ from support import (
     numpy_forward,
     random_columns,
     shapes_of,
-    train_on,
     unraveled,
 )
 
@@ -183,38 +182,3 @@ def test_the_first_episodes_are_for_warming_up_uniformly(case):
 def test_the_world_takes_continuous_actions_in_its_own_units():
     action = agent_of("continuous").env_action(jnp.float32([0.5, -1.0]))
     np.testing.assert_array_equal(action, [1.0, -2.0])
-
-
-# --- probes --------------------------------------------------------------------------------------
-
-
-def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
-    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
-    # ends it with 1 and action 1 with 0. With alpha 0.5 and gamma 0.8 the best policy is
-    # softmax(Q / alpha) and a state's value alpha log sum exp(Q / alpha): V(B) = 0.5 ln(e^2 + 1) =
-    # 1.0635, Q(A) = [0.5, 0.8 * 1.0635] and so on. The end looks like A: bootstrapping there would
-    # show.
-    alpha, gamma = 0.5, 0.8
-    config = SACConfig(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.02,
-                       tau=0.1, discount=gamma, alpha=alpha)  # fmt: skip
-    sac = DiscreteSAC(config, 2, 2)
-    agent = sac.agent()
-    a, b = [1.0, 0.0], [0.0, 1.0]
-    batch = Transition(obs=np.float32([a, a, b, b]).T, action=np.int32([0, 1, 0, 1]),
-                       reward=np.float32([0.5, 0.0, 1.0, 0.0]),
-                       discount=np.float32([0.0, 1.0, 0.0, 0.0]),
-                       next_obs=np.float32([a, b, a, a]).T)  # fmt: skip
-
-    @jax.jit
-    def learned():
-        params = sac.unflatten(train_on(agent, batch, 500).params)
-        states = np.eye(2, dtype=np.float32)  # columns: A and B
-        policy = jax.nn.softmax(sac.outputs(params, states), axis=0)
-        return sac.critics(params.critics, states), policy
-
-    value_b = alpha * np.log(np.exp(1 / alpha) + 1)
-    q_values = np.array([[0.5, 1.0], [gamma * value_b, 0.0]])  # [action, state]
-    expected = np.exp(q_values / alpha) / np.exp(q_values / alpha).sum(axis=0)
-    got, policy = learned()
-    np.testing.assert_allclose(got, np.stack([q_values] * 2), atol=0.03)
-    np.testing.assert_allclose(policy, expected, atol=0.03)

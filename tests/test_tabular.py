@@ -213,22 +213,3 @@ def test_q_learning_finds_the_shortest_way_along_the_cliff_and_never_undervalues
     assert (values >= expected - 1e-4).all()
     way = [36, *range(24, 36)]  # up, along the cliff's edge, and down
     np.testing.assert_allclose(values[:, way], np.tile(expected[way], (6, 1)), atol=1e-4)
-
-
-@pytest.mark.parametrize(("make", "worth"), [(q_learning, 1.0), (sarsa, 0.8)])
-def test_sarsa_values_its_own_exploration_and_q_learning_the_best_action(make, worth):
-    # 0 -> 1 for nothing; from 1 action 0 earns 1 and action 1 nothing. With epsilon 0.4 the policy
-    # earns 0.6 * 1 + 0.4 * 0.5 = 0.8 there on average, the best action 1.
-    agent = make(2, 2, learning_rate=0.05)
-    state = started(agent, [[0.0, 0.0], [1.0, 0.0]])
-
-    def learn(key):
-        def body(state, key):
-            return agent.update(key, state, step(0, 0, 0.0, 1.0, 1)), None
-
-        return jax.lax.scan(body, state, jax.random.split(key, 300))[0]
-
-    values = jax.jit(jax.vmap(learn))(jax.random.split(KEY, 400)).q_values
-    values = np.asarray(values)[:, 0, 0]
-    error = np.std(values) / np.sqrt(values.size)
-    np.testing.assert_allclose(np.mean(values), 0.9 * worth, atol=5 * error + 1e-5)

@@ -1,4 +1,4 @@
-"""sejax.agents.td3: updates against torch, noise, exploration, Gumbel-Softmax, probe MDPs."""
+"""sejax.agents.td3: updates against torch, noise, exploration, Gumbel-Softmax."""
 
 import functools
 from dataclasses import replace
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import drawing, numpy_forward, random_columns, raveled, shapes_of, train_on, unraveled
+from support import drawing, numpy_forward, random_columns, raveled, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
@@ -298,43 +298,3 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
         drawn_actions(noisy, explore=False, warming_up=True), drawn_actions(config, explore=True),
         rtol=1e-5, atol=1e-6,
     )  # fmt: skip
-
-
-# --- probes --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("one_hot", [False, True], ids=["relaxed", "one_hot"])
-def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(one_hot):
-    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
-    # ends it with 1 and action 1 with 0. With gamma 0.8 waiting is worth 0.8: Q(A) = [0.5, 0.8],
-    # Q(B) = [1, 0], policy 1 in A and 0 in B. The end looks like A: bootstrapping there would show.
-    # The actions are such as the policy gives, as critics are wild where they have seen nothing.
-    config = DiscreteTD3Config(
-        hidden_size=16, num_layers=2, learning_rate=0.003, tau=0.1, discount=0.8,
-        target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
-    )  # fmt: skip
-    td3 = DiscreteTD3(config, 2, 2, 1.0)
-    agent = td3.agent()
-    gumbel = np.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
-    taken, in_a = np.argmax(gumbel, axis=0), np.arange(64) % 2 == 0
-    waits = in_a & (taken == 1)
-    states = np.float32([[1, 0], [0, 1]])  # columns: A and B
-
-    @jax.jit
-    def run(key):
-        batch = Transition(
-            obs=np.where(in_a, states[:, :1], states[:, 1:]),
-            action=gumbel_softmax(jnp.zeros((2, 64)), gumbel, 0.3, one_hot),
-            reward=np.float32(np.where(taken == 0, np.where(in_a, 0.5, 1.0), 0.0)),
-            discount=np.float32(waits),
-            next_obs=np.where(waits, states[:, 1:], states[:, :1]),
-        )
-        state = train_on(agent, batch, 1000)
-        actions = [agent.env_action(agent.act(key, state, obs, explore=False)) for obs in states.T]
-        pairs = np.repeat(states, 2, axis=1), np.tile(np.eye(2, dtype=np.float32), 2)
-        return actions, [td3.q_value(critic, *pairs) for critic in state.critics]
-
-    actions, q_values = run(jax.random.key(0))
-    assert [int(action) for action in actions] == [1, 0]
-    for got in q_values:
-        np.testing.assert_allclose(got, [0.5, 0.8, 1.0, 0.0], atol=0.1)

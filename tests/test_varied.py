@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import paper_se, paper_training, random_columns
+from support import random_columns
 
 import sejax
 from sejax import envs
@@ -20,7 +20,6 @@ from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
-from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.ops.networks import MLP, narrow
 
 OBS_DIM, NUM_ACTIONS = 3, 2
@@ -62,21 +61,6 @@ def test_draws_fill_their_range_with_the_density_they_should_have(bounds):
         drawn = drawn + np.random.default_rng(0).uniform(-0.5, 0.5, drawn.shape)
     share = (scale(drawn) - low) / (high - low)
     assert np.abs(np.sort(share) - np.linspace(0, 1, share.size)).max() < 0.02  # Kolmogorov-Smirnov
-
-
-@pytest.mark.parametrize("num_layers", [1, 2, 3])
-@pytest.mark.parametrize("low, high", [(42, 384), (7, 72), (19, 171), (1, 9)])
-def test_every_hidden_size_has_a_network_and_little_arithmetic_is_wasted(num_layers, low, high):
-    sizes = np.array(hidden_sizes(Range(low, high, True, True), num_layers))
-    assert high <= sizes[-1] < high + 32 and sizes[-2:-1] < (high,)
-    assert low <= sizes[0] < low + 32 and (np.diff(sizes) > 0).all()
-    if high < 200:
-        return
-    drawn = np.arange(low, high + 1)
-    rooms = np.array([sizes[sizes >= size].min() for size in drawn])
-    # A layer between hidden ones costs the square of its size; sizes are drawn log-uniformly.
-    power = 1 if num_layers == 1 else 2
-    assert (rooms**power / drawn).sum() / (drawn.astype(float) ** (power - 1)).sum() < 1.2
 
 
 # --- narrow networks -----------------------------------------------------------------------------
@@ -314,32 +298,3 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
     # An agent that nothing is drawn for runs with its own.
     which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
     assert (which, scaled) == (0, 3.0)
-
-
-@pytest.mark.slow
-def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
-    task = envs.make("cartpole")
-    env = paper_se(hidden_size=4).make(task)
-    training = paper_training(stop_rule="never", max_steps=60, test_episodes=2)
-    # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
-    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, warmup_episodes=0)
-    varied = make_agent(config, task, varied=True)
-    assert len(varied.varied.agents) == 2
-    keys = jax.random.split(jax.random.key(5), 3)
-    outcome = evaluate_agents(varied, env, env.default_params, task, training, keys, devices=1)
-
-    @functools.cache
-    def alone(variant):
-        def train(key, hparams):
-            agent = dataclasses.replace(varied.varied.agents[variant], hparams=hparams)
-            return make_evaluator(agent, env, task, training)(key, env.default_params)
-
-        return jax.jit(train)
-
-    draw = jax.jit(lambda key: varied.varied.draw(drawing_key(key)))
-    draws = [draw(key) for key in keys]
-    assert {int(drawn.variant) for drawn in draws} == {0, 1}
-    for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):
-        expected = alone(int(drawn.variant))(key, drawn.hparams)
-        np.testing.assert_array_equal(outcome.test_returns[i], expected.test_returns)
-        assert outcome.train_steps[i] == expected.train_steps == 60

@@ -166,9 +166,7 @@ class DDQN(OffPolicy):
         epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
         return state.replace(epsilon=epsilon)
 
-    def act(
-        self, key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool
-    ) -> Array:
+    def act(self, key: Array, state: DDQNState, obs: Array, explore: bool) -> Array:
         q_values = self.network.apply(state.params, obs)
         if not explore:
             return jnp.argmax(q_values).astype(jnp.int32)

@@ -11,6 +11,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -183,8 +184,8 @@ def with_icm(
     Source: `docs/reference.md` 4.8.
 
     Example:
-      >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
-      >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
+      >>> from sejax.agents.dqn import DDQN, DDQNConfig
+      >>> plain = DDQN(DDQNConfig(), obs_dim=4, num_actions=2).agent()
       >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, action_width=2, is_discrete=True)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
@@ -246,7 +247,8 @@ class Curious:
     def update(self, key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
         if isinstance(batch, Rollout):
             # The agent's update is inside: its rows with the bonus would else be made in each step.
-            return batch.learn_if_full(lambda state: self.learn(key, state, batch), state)
+            learn = functools.partial(self.learn, key, rollout=batch)
+            return batch.learn_if_full(learn, state)
         state = self.train(state, batch)
         batch = batch._replace(reward=batch.reward + self.bonus(state, batch))
         return state.replace(agent_state=self.agent.update(key, state.agent_state, batch))
@@ -260,10 +262,7 @@ class Curious:
 
 
 def icm_loss(
-    outputs: ICMOutputs,
-    action: Array,
-    forward_weight: Array | float,
-    weight: Array | float = 1.0,
+    outputs: ICMOutputs, action: Array, forward_weight: Array, weight: Array | float = 1.0
 ) -> Array:
     r"""What the three models minimise together.
 
@@ -285,7 +284,7 @@ def icm_loss(
     Source: Pathak et al. (2017), eq. 2 to 7; `docs/reference.md` 4.8.
     """
     predicted = outputs.predicted_action
-    if _is_index(action):
+    if action.ndim == 1:  # indices
         chosen = as_vectors(action, predicted.shape[0])
         inverse = jax.nn.logsumexp(predicted, axis=0) - jnp.sum(chosen * predicted, axis=0)
     else:
@@ -302,14 +301,9 @@ def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
 
 def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
     """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
-    if not _is_index(action):
+    if action.ndim > 1:
         return action
     return (jnp.arange(width)[:, None] == action[None, :]).astype(jnp.float32)
-
-
-def _is_index(action: Array) -> bool:
-    """Whether a feature-major batch of actions holds indices."""
-    return action.ndim == 1
 
 
 # --- counts --------------------------------------------------------------------------------------
@@ -361,8 +355,8 @@ def with_count_bonus(
       num_actions: number of different actions.
 
     Example:
-      >>> from sejax.agents.tabular import QLearningConfig, make_tabular
-      >>> plain = make_tabular(QLearningConfig(), num_states=48, num_actions=4)
+      >>> from sejax.agents.tabular import QLearningConfig, Tabular
+      >>> plain = Tabular(QLearningConfig(), num_states=48, num_actions=4).agent()
       >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))

@@ -46,6 +46,7 @@ from sejax.options import (
 )
 
 Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
+Moved = tuple[Array, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 ADVANTAGES = ("monte_carlo", "gae")
@@ -256,9 +257,7 @@ class PPO(Learner):
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
-    def act(
-        self, key: Array, state: PPOState, obs: Float[Array, " obs_dim"], explore: bool
-    ) -> Array:
+    def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
         tree = self.unflatten(state.params)
         outputs: Any = self.actor.apply(tree["actor"], obs)
         return self.sample(key, outputs, tree["std"]) if explore else self.mode(outputs)
@@ -334,9 +333,7 @@ class PPO(Learner):
         batch, return_sums = self.prepared(state, steps, rollout.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
 
-        def adam_step(
-            number: Array, carry: tuple[Array, optax.OptState]
-        ) -> tuple[Array, optax.OptState]:
+        def adam_step(number: Array, carry: Moved) -> Moved:
             params, opt_state = carry
             minibatch = batch
             if config.num_minibatches > 1:

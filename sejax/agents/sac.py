@@ -161,9 +161,7 @@ class SAC(ActorCritic):
         outputs: Any = self.actor.apply(params.actor, obs)
         return outputs
 
-    def act(
-        self, key: Array, state: SACState, obs: Float[Array, " obs_dim"], explore: bool
-    ) -> Array:
+    def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
         outputs = self.outputs(self.unflatten(state.params), obs)
         if not explore:
             return self.best(outputs)

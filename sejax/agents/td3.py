@@ -160,9 +160,7 @@ class TD3(ActorCritic):
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
-    def act(
-        self, key: Array, state: TD3State, obs: Float[Array, " obs_dim"], explore: bool
-    ) -> Array:
+    def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
         outputs = self.actor.apply(state.actor, obs)
         if not explore and not self.config.noisy_tests:
             return self.best(outputs)
