@@ -57,7 +57,6 @@ ACTOR_CRITIC = OFF_POLICY | {
 }  # fmt: skip
 AGENTS = {
     "ddqn": sejax.DDQNConfig(**OFF_POLICY),
-    "dueling_ddqn": sejax.DuelingDDQNConfig(**OFF_POLICY, feature_dim=16, stream_hidden_size=16),
     "td3": sejax.TD3Config(**ACTOR_CRITIC),
     "td3_discrete": sejax.DiscreteTD3Config(
         **OFF_POLICY, target_noise_std=0.0, final_temperature=1.0

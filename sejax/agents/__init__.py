@@ -100,13 +100,14 @@ def require_fit(
     require_part("agent", AgentConfig, agent, "Pass an object, such as DDQNConfig().")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     agent_name = registry.name_of("agent", agent)
-    fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
-    require(
-        _fits(agent, spec),
-        "agent",
-        f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
-        f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
-    )
+    if not _fits(agent, spec):
+        fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
+        require(
+            False,
+            "agent",
+            f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
+            f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
+        )
     exploration_name = shortened(registry.name_of("exploration", exploration))
     require(
         exploration.states is None or agent.states in (None, exploration.states),
