@@ -30,7 +30,7 @@ from flax import struct
 from jax import Array
 
 import sejax
-from sejax.agents import AgentOptions, Transition, replay_buffer, traced
+from sejax.agents import AgentOptions, Hparams, Transition, replay_buffer, traced
 from sejax.options import counts, fraction, option, positive
 
 MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
@@ -58,7 +58,7 @@ class SAC(AgentOptions):
         """The agent for a task's observations and actions."""
         networks = Networks(Actor(task.action_dim, self.hidden_size), Critic(self.hidden_size))
 
-        def init(key: Array, hparams: SACHparams) -> SACState:
+        def init(key: Array, hparams: Hparams) -> SACState:
             params = networks.init(key, jnp.zeros(task.obs_dim), jnp.zeros(task.action_dim))
             return SACState(params=params, target_critics=params["critics"],
                             opt_state=ADAM.init(params), is_warming_up=jnp.bool_(True),
@@ -81,19 +81,11 @@ class SAC(AgentOptions):
 
         return sejax.Agent(
             init=init, begin_episode=begin_episode, act=act, update=update, 
-            hparams=traced(self, SACHparams),
+            hparams=traced(self),
             buffer=replay_buffer(self.batch_size, self.buffer_size), spec=self.spec(),
             discount=lambda hparams: hparams.discount,
             env_action=lambda action: task.max_action * action,  # remembered in [-1, 1]
         )  # fmt: skip
-
-
-class SACHparams(NamedTuple):
-    """The options that are traced."""
-
-    learning_rate: Array | float
-    tau: Array | float
-    discount: Array | float
 
 
 class SACState(struct.PyTreeNode):
@@ -103,7 +95,7 @@ class SACState(struct.PyTreeNode):
     target_critics: Any
     opt_state: optax.OptState
     is_warming_up: Array
-    hparams: SACHparams
+    hparams: Hparams
 
 
 def hidden_layers(x: Array, size: int) -> Array:

@@ -26,11 +26,7 @@ from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import LARGEST, require
 from sejax.options.parts import require_part
 from sejax.proxies.base import ProxyEnv, is_real
-from sejax.training import (
-    TrainingConfig,
-    TrainResult,
-    make_trainer,
-)
+from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 # --- greedy episodes ------------------------------------------------------------------------------
 
@@ -72,36 +68,30 @@ class _Episode:
     env_state: PyTree
 
 
-class _Greedy:
-    """One greedy episode of an agent in an environment: its beginning, and each step."""
+def _greedy(
+    agent: Agent, env: Environment
+) -> tuple[Callable[..., _Episode], Callable[..., tuple[_Episode, Steps]]]:
+    """Builds the beginning of a greedy episode, `(key, active, params) -> episode`, and a step.
 
-    def __init__(self, agent: Agent, env: Environment):
-        self.agent, self.env = agent, env
+    The step is `(key, agent_state, before, params) -> (after, decision)`, with the key of the whole
+    episode.
+    """
 
-    def begin(self, key: Array, active: Array | bool, params: PyTree) -> _Episode:
-        obs, env_state = self.env.reset_env(key, params)
-        return _Episode(
-            active=jnp.asarray(active),
-            num_steps=jnp.int32(0),
-            total=jnp.float32(0),
-            scored=jnp.float32(0),
-            obs=obs,
-            env_state=env_state,
-        )
+    def begin(key: Array, active: Array | bool, params: PyTree) -> _Episode:
+        obs, env_state = env.reset_env(key, params)
+        zero = jnp.float32(0)
+        return _Episode(jnp.asarray(active), jnp.int32(0), zero, zero, obs, env_state)
 
     def step(
-        self, key: Array, agent_state: AgentState, before: _Episode, params: PyTree
+        key: Array, agent_state: AgentState, before: _Episode, params: PyTree
     ) -> tuple[_Episode, Steps]:
-        """The episode after a decision, and the decision; `key` is that of the whole episode."""
         key_act, key_env = step_keys(key, before.num_steps, 2)
-        action = self.agent.act(key_act, agent_state, before.obs, explore=False)
-        action = self.agent.env_action(action)
-        obs, env_state, reward, terminated, info = self.env.step_env(
+        action = agent.env_action(agent.act(key_act, agent_state, before.obs, explore=False))
+        obs, env_state, reward, terminated, info = env.step_env(
             key_env, before.env_state, action, params
         )
-        truncated = self.env.is_truncated(env_state, params)
         after = _Episode(
-            active=~(terminated | truncated),
+            active=~(terminated | env.is_truncated(env_state, params)),
             num_steps=before.num_steps + info.get("num_steps", 1),
             total=before.total + reward,
             scored=before.scored + info.get("scored_reward", reward),
@@ -110,6 +100,8 @@ class _Greedy:
         )
         steps = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
         return after, steps
+
+    return begin, step
 
 
 def make_tester(
@@ -131,18 +123,18 @@ def make_tester(
         action repeat; by default that itself.
     """
     env = repeat_actions(task.env, agent.spec.action_repeat)
-    greedy = _Greedy(agent, test_env(env))
+    begin, decide = _greedy(agent, test_env(env))
 
     def step(
         nothing: Array, state: _Episode, consts: PyTree, masked: bool
     ) -> tuple[Array, _Episode]:
         key, agent_state, params = consts
-        after, _ = greedy.step(key, agent_state, state, task.params if params is None else params)
-        return nothing, after
+        params = task.params if params is None else params
+        return nothing, decide(key, agent_state, state, params)[0]
 
     def episode(key: Array, agent_state: AgentState, active: Array | bool, params: PyTree) -> Tests:
         key_reset, key_steps = jax.random.split(key)
-        state = greedy.begin(key_reset, active, task.params if params is None else params)
+        state = begin(key_reset, active, task.params if params is None else params)
         consts = (key_steps, agent_state, params)
         _, state = while_any_active(step, jnp.zeros(0), state, consts)
         return Tests(state.total, state.num_steps, state.scored)
@@ -164,16 +156,16 @@ def make_recorder(
     The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
     one step here.
     """
-    greedy = _Greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
+    begin, decide = _greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
 
     def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
-            after, steps = greedy.step(key_steps, agent_state, state, task.params)
+            after, steps = decide(key_steps, agent_state, state, task.params)
             return dataclasses.replace(after, active=state.active & after.active), steps
 
-        start = greedy.begin(key_reset, True, task.params)
+        start = begin(key_reset, True, task.params)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
     def record(key: Array, agent_state: AgentState) -> Steps:
@@ -226,7 +218,31 @@ def make_evaluator(
     _require_evaluation(task, training)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
-        return _evaluation(agent, env, task, training, test_env)
+        test = make_tester(agent, task, training.test_episodes, test_env)
+        train = make_tested_trainer(agent, env, task, training)
+
+        def run(
+            key: Array,
+            env_params: PyTree,
+            active: Array | bool,
+            test_params: PyTree,
+            hparams: Hparams,
+        ) -> Outcome:
+            key_train, key_test = jax.random.split(key)
+            result = train(key_train, env_params, hparams, active)
+            tests = test(key_test, result.agent_state, active, test_params)
+            real_steps = tests.num_steps.sum() + result.eval_steps
+            return Outcome(
+                test_returns=tests.returns,
+                scored_returns=tests.scored,
+                train_steps=result.train_steps,
+                train_episodes=result.episodes,
+                auc=area_under_curve(result, tests.returns.mean()),
+                nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
+                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
+            )
+
+        return run
 
     run = agent.fresh(make_run)
     return lambda key, env_params, active=True, test_params=None: run(
@@ -246,41 +262,6 @@ def _require_evaluation(task: Task, training: TrainingConfig) -> None:
         f"steps, because an agent may never end it; got {task.max_steps:,} for {task.name}. Set "
         "env.max_steps=N, or Task(max_steps=N).",
     )
-
-
-def _evaluation(
-    agent: Agent,
-    env: Environment,
-    task: Task,
-    training: TrainingConfig,
-    test_env: Callable[[Environment], Environment],
-) -> Callable[..., Outcome]:
-    """Builds `run(key, env_params, active, test_params, hparams) -> Outcome`."""
-    test = make_tester(agent, task, training.test_episodes, test_env)
-    train = make_tested_trainer(agent, env, task, training)
-
-    def run(
-        key: Array,
-        env_params: PyTree,
-        active: Array | bool,
-        test_params: PyTree,
-        hparams: Hparams,
-    ) -> Outcome:
-        key_train, key_test = jax.random.split(key)
-        result = train(key_train, env_params, hparams, active)
-        tests = test(key_test, result.agent_state, active, test_params)
-        real_steps = tests.num_steps.sum() + result.eval_steps
-        return Outcome(
-            test_returns=tests.returns,
-            scored_returns=tests.scored,
-            train_steps=result.train_steps,
-            train_episodes=result.episodes,
-            auc=area_under_curve(result, tests.returns.mean()),
-            nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-            real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
-        )
-
-    return run
 
 
 def make_tested_trainer(

@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PyTree
 
+from sejax.agents.base import Agent
 from sejax.es.base import Groups, StrategyState
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
 from sejax.objectives import Outcome
@@ -82,12 +83,9 @@ class GenerationEvaluator:
         self.devices = devices
         agents, objective = scoring.mixture.agents, scoring.objective
         training = tested_throughout(training) if objective.needs_tests else training
-        evaluators = [
-            make_evaluator(agent, proxy, proxy.task, training, objective.test_env)
-            for agent in agents
-        ]
 
-        def run_with(evaluate: Callable[..., Outcome]) -> Callable[[Trainings], Outcome]:
+        def run_with(agent: Agent) -> Callable[[Trainings], Outcome]:
+            evaluate = make_evaluator(agent, proxy, proxy.task, training, objective.test_env)
             return lambda training: evaluate(
                 training.key,
                 proxy.params(unravel(training.candidate)),
@@ -95,7 +93,7 @@ class GenerationEvaluator:
                 training.test_params,
             )
 
-        self.runs = [run_with(evaluate) for evaluate in evaluators]
+        self.runs = [run_with(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
         self.sizes = [scoring.trainings_of(agent).size for agent in range(len(agents))]
         self._scoring = scoring

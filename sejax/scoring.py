@@ -193,8 +193,5 @@ class Scoring:
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
         """A statistic of each agent's trainings, of the population alone if there are no more."""
-        statistics = []
-        for agent in range(self.mixture.size):
-            numbers = self.trainings_of(agent)
-            statistics.append(statistic(values[numbers[numbers < values.size]]))
-        return jnp.stack(statistics)
+        by_agent = map(self.trainings_of, range(self.mixture.size))
+        return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])

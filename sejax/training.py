@@ -166,30 +166,8 @@ class TrainResult:
 
 
 @struct.dataclass
-class _Curve:
-    """A row for each finished episode, `[max_episodes]`; large, so that it is written in place."""
-
-    returns: Array
-    ends: Array
-    test_returns: Array | None
-
-    def with_episode(
-        self, episode: Array, episode_return: Array, end: Array, tested: Array, ended: Array
-    ) -> "_Curve":
-        """The episode's row is written if it has ended: an index out of range is dropped."""
-        row = jnp.where(ended, episode, self.ends.shape[0])
-
-        tests = self.test_returns
-        return _Curve(
-            returns=self.returns.at[row].set(episode_return, mode="drop"),
-            ends=self.ends.at[row].set(end, mode="drop"),
-            test_returns=None if tests is None else tests.at[row].set(tested, mode="drop"),
-        )
-
-
-@struct.dataclass
 class _LoopState:
-    """Carry of the step loop. Buffers and the curve are carried beside it."""
+    """Carry of the step loop. Buffers and a row for each episode are carried beside it."""
 
     active: Array
     step: Array  # decisions
@@ -256,17 +234,6 @@ def make_trainer(
       >>> result.returns.shape
       (8, 20)
     """
-    _require_parts(agent, env, training)
-    if training.num_tests_between and test_fn is None:
-        raise ValueError(
-            f"tests after each episode (training.num_tests_between is "
-            f"{training.num_tests_between}) need a test_fn; got None."
-        )
-    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
-
-
-def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> None:
-    """Checks that the arguments are what they are called, in their order."""
     require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
     fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
     must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
@@ -281,6 +248,12 @@ def _require_parts(agent: Agent, env: Environment, training: TrainingConfig) -> 
     )
     require_part("training", TrainingConfig, training)
     require_modes()
+    if training.num_tests_between and test_fn is None:
+        raise ValueError(
+            f"tests after each episode (training.num_tests_between is "
+            f"{training.num_tests_between}) need a test_fn; got None."
+        )
+    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
 
 
 class _Loop:
@@ -314,7 +287,7 @@ class _Loop:
         self,
         key: Array,
         env_params: PyTree,
-        hparams: Hparams = None,
+        hparams: Hparams | None = None,
         active: Array | bool = True,
     ) -> TrainResult:
         """One training; `hparams` None are the agent's own."""
@@ -325,11 +298,9 @@ class _Loop:
         stored = tuple(buffer.init() for buffer in self.buffers(state))
         max_episodes = self.training.max_episodes
         no_returns = jnp.full(max_episodes, jnp.nan)
-        curve = _Curve(
-            returns=no_returns,
-            ends=jnp.zeros(max_episodes, jnp.int32),
-            test_returns=None if self.test_fn is None else no_returns,
-        )
+        curve = {"returns": no_returns, "episode_ends": jnp.zeros(max_episodes, jnp.int32)}
+        if self.test_fn is not None:
+            curve["test_returns"] = no_returns
         (stored, curve), state = while_any_active(
             self.step, (stored, curve), state, (key_steps, env_params)
         )
@@ -337,9 +308,7 @@ class _Loop:
             agent_state=state.agent_state,
             train_steps=state.train_steps,
             episodes=state.episode,
-            returns=curve.returns,
-            test_returns=curve.test_returns,
-            episode_ends=curve.ends,
+            **{"test_returns": None} | curve,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             eval_steps=state.eval_steps,
             recorded=stored[1] if len(stored) > 1 else None,
@@ -427,9 +396,14 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(keys_end, s, env_params, finished), lambda s: s, state
         )
-        curve = curve.with_episode(
-            before.episode, before.episode_return, train_steps, state.tested, finished
-        )
+        rows = {
+            "returns": before.episode_return,
+            "episode_ends": train_steps,
+            "test_returns": state.tested,
+        }
+        # Written in place; a row that is out of range is dropped.
+        number = jnp.where(finished, before.episode, self.training.max_episodes)
+        curve = {name: x.at[number].set(rows[name], mode="drop") for name, x in curve.items()}
         return (stored, curve), state
 
     def end_episode(

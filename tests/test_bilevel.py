@@ -150,25 +150,6 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
     assert not copies, copies
 
 
-def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests():
-    program = program_of("objective.first_eval_steps=1", words=ROOM)
-    state = program.init(KEYS[0])
-    # Of 8 members and 4 incumbents all whole tests are alike; the fourth member's part is best.
-    whole, part = np.full((12, 2), 0.5, np.float32), np.zeros((12, 2), np.float32)
-    part[3] = 0.25
-    counts = np.full(12, 3, np.int32)
-    outcome = sejax.Outcome(
-        test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
-        auc=part[..., 0], nonfinite=counts < 0, real_steps=counts,
-    )  # fmt: skip
-    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
-        state
-    )
-    # All Better 2 with one member that is better: the mean moves to it.
-    np.testing.assert_allclose(after.es_state.mean, asked.population[3], rtol=1e-5, atol=1e-6)
-    assert info.incumbent_mean == info.population_mean == after.best_score == 0.5
-
-
 # --- the same numbers, however it is run ---------------------------------------------------------
 
 
@@ -268,18 +249,14 @@ def test_a_number_of_generations_that_cannot_be_is_refused(generations):
 @pytest.mark.parametrize(
     ("words", "overrides"),
     [
-        (ROOM, ("es=open_es",)), (ROOM, ("es=cma_es",)), (ROOM, ("es=snes",)),
-        (ROOM, ("objective=reward_threshold",)), (ROOM, ("objective=auc",)),
-        (ROOM, ("es.mirrored=false", "es.num_evals=2")), (ROOM, ("es.common_random_numbers=true",)),
-        (ROOM, ("es.update_rule=paper",)), (ROOM, ("proxy.done=threshold",)),
-        (ROOM, ("proxy=rn",)), (TINY, ("env=acrobot",)),
+        (ROOM, ("es=open_es",)), (ROOM, ("proxy=rn", "objective=auc")),
+        (ROOM, ("es.mirrored=false", "es.num_evals=2")),
         (TINY, ("agent.activation=prelu", "proxy.activation=prelu", "proxy.done=threshold")),
     ],
     ids=lambda words: " ".join(words) if isinstance(words, tuple) else words[0],
 )  # fmt: skip
 def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     # Tracing only: the state that comes out has the types of the one that goes in.
-    assert {"open_es", "cma_es", "snes"} <= set(registry.names("es"))
     program = program_of(*overrides, words=words)
     state = jax.eval_shape(program.init, KEYS[0])
     after, info = jax.eval_shape(program.generation, state)

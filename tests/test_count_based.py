@@ -8,14 +8,14 @@ from test_tabular import step, trained
 
 from sejax import envs
 from sejax.agents.exploration import CountBasedConfig, with_count_bonus
-from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, Tabular
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
-PLAIN = make_tabular(
+PLAIN = Tabular(
     QLearningConfig(learning_rate=0.5, discount=0.9, epsilon_init=0.8, epsilon_decay=0.5),
     NUM_STATES, NUM_ACTIONS,
-)  # fmt: skip
+).agent()  # fmt: skip
 
 
 def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTIONS, power=1.0):
@@ -27,7 +27,7 @@ def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTI
     ("config", "power"), [(QLearningConfig, 1.0), (SARSAConfig, 1.0), (QLearningConfig, 0.5)]
 )
 def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config, power):
-    plain = make_tabular(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS)
+    plain = Tabular(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS).agent()
     agent = counting(plain, power=power)
     rng = np.random.default_rng(0)
     state, expected = agent.init(KEY, agent.hparams), plain.init(KEY, plain.hparams)
@@ -50,8 +50,8 @@ def test_beta_and_the_numbers_inside_are_traced():
     assert agent.hparams.agent == PLAIN.hparams and agent.hparams.reward_scale == BETA
 
     def after(beta, rate):
-        inner = agent.hparams.agent._replace(learning_rate=rate)
-        state = agent.init(KEY, agent.hparams._replace(agent=inner, reward_scale=beta))
+        inner = agent.hparams.agent.replace(learning_rate=rate)
+        state = agent.init(KEY, agent.hparams.replace(agent=inner, reward_scale=beta))
         return agent.update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
 
     got = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
@@ -63,7 +63,7 @@ def test_beta_and_the_numbers_inside_are_traced():
 
 def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bonus():
     task = envs.make("cliff_walking")
-    plain = make_tabular(QLearningConfig(warmup_episodes=2), 48, 4)
+    plain = Tabular(QLearningConfig(warmup_episodes=2), 48, 4).agent()
     agent = counting(plain, 0.1, 48, 4)
     result, test_returns = trained(agent, task, num_episodes=200, num_agents=4)
     np.testing.assert_array_equal(test_returns, -12.0)

@@ -1,10 +1,9 @@
-"""sejax.agents.dqn: updates against torch, exploration, and a probe MDP."""
+"""sejax.agents.dqn: updates against torch, and exploration."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import (
@@ -13,13 +12,11 @@ from support import (
     numpy_forward,
     random_columns,
     shapes_of,
-    train_on,
     unraveled,
 )
 
 from sejax.agents.buffers import Transition
-from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
-from sejax.ops.networks import MLP
+from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
 from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
@@ -57,7 +54,7 @@ def random_batch(seed):
 
 @pytest.fixture(scope="module")
 def agent():
-    return make_ddqn(CONFIG, OBS_DIM, NUM_ACTIONS)
+    return DDQN(CONFIG, OBS_DIM, NUM_ACTIONS).agent()
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +87,7 @@ def nested_params(config):
 @pytest.mark.parametrize(("agent_name", "case", "config"), GOLDEN_UPDATES)
 def test_updates_equal_torchs_on_the_same_batches(agent_name, case, config):
     golden = np.load(GOLDEN / f"{agent_name}_updates.npz")
-    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+    agent = DDQN(config, OBS_DIM, NUM_ACTIONS).agent()
     params = (golden[f"{case}/{name}/0"] for name in ("params", "target_params"))
     state, update = state_with(agent, *params), jax.jit(agent.update)
     for number in range(1, 6):
@@ -104,82 +101,30 @@ def test_updates_equal_torchs_on_the_same_batches(agent_name, case, config):
 def test_a_dueling_agent_trains_alone_on_a_core():
     # In lockstep its streams' products take longer; DDQN of the same size gains by it.
     small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
-    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).spec.cpu_num_parallel == 1
-    assert make_ddqn(DDQNConfig(**small), 4, 2).spec.cpu_num_parallel > 1
+    assert DDQN(DuelingDDQNConfig(**small), 4, 2).agent().spec.cpu_num_parallel == 1
+    assert DDQN(DDQNConfig(**small), 4, 2).agent().spec.cpu_num_parallel > 1
 
 
-# --- when it learns ------------------------------------------------------------------------------
+# --- exploration ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def rarely():
-    """An agent that learns in every second step, twice, with epsilon by steps; its update."""
-    config = replace(
-        CONFIG, train_every=2, gradient_steps=2, exploration_steps=4, epsilon_init=0.9,
-        epsilon_min=0.1,
-    )  # fmt: skip
-    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-    return agent, jax.jit(agent.update)
-
-
-def in_turns(parts):
-    """Batches whose columns take turns, and a last column that does not count."""
-    counted = [part._replace(weight=np.ones(BATCH, np.float32)) for part in parts]
-    batch = jax.tree.map(lambda *x: np.stack(x, -1).reshape(*x[0].shape[:-1], -1), *counted)
-    batch = jax.tree.map(lambda x: np.concatenate([x, x[..., -1:]], -1), batch)
-    batch.weight[-1] = 0
-    return batch
-
-
-def test_every_second_step_learns_twice_from_a_batch_of_twice_the_columns(rarely, state, update):
-    agent, learn = rarely
-    parts = [random_batch(number) for number in (1, 2)]
-    batch = in_turns(parts)
-    start = state_with(agent, np.asarray(state.params), np.asarray(state.target_params))
-    first = learn(jax.random.key(0), start, batch)
-    np.testing.assert_array_equal(first.params, state.params)
-    second = learn(jax.random.key(0), first, batch)
-    expected = state
-    for part in parts:
-        expected = update(jax.random.key(0), expected, part)
-    np.testing.assert_allclose(second.params, expected.params, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(second.target_params, expected.target_params, rtol=1e-5, atol=1e-7)
-    assert int(second.opt_state.count) == 2
-
-
-def test_the_buffer_draws_a_batch_for_each_gradient_step(rarely):
-    agent, _ = rarely
-    numbers = agent.hparams._replace(batch_size=np.float32(3))
-    state = shapes_of(agent.init, jax.random.key(1), numbers)
-    assert agent.batch_size(state.replace(hparams=numbers)) == 6
-    one = Transition(np.zeros(3, np.float32), np.int32(0), np.float32(0), np.float32(0),
-                     np.zeros(3, np.float32))  # fmt: skip
-    buffer = agent.buffer(one, 10)
-    batch = jax.eval_shape(
-        lambda key: buffer.batch(key, buffer.init(), jnp.int32(1), one, None), jax.random.key(0)
-    )
-    assert batch.reward.shape == (16,)  # 2 * 7, in whole vectors
-
-
-def test_epsilon_by_steps_falls_linearly_whatever_the_episodes(rarely):
-    agent, learn = rarely
-    batch = in_turns([random_batch(0)] * 2)
+def test_epsilon_by_steps_falls_linearly_whatever_the_episodes():
+    config = replace(CONFIG, exploration_steps=4, epsilon_init=0.9, epsilon_min=0.1)
+    agent = DDQN(config, OBS_DIM, NUM_ACTIONS).agent()
+    learn = jax.jit(agent.update)
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
     state = state.replace(hparams=jax.tree.map(np.float32, agent.hparams), epsilon=np.float32(0.9))
     epsilons = []
     for episode in range(6):  # of one step
         state = agent.begin_episode(state, np.int32(episode))
         epsilons.append(float(state.epsilon))
-        state = learn(jax.random.key(0), state, batch)
+        state = learn(jax.random.key(0), state, random_batch(0))
     # From 0.9 to 0.1 in four steps of 0.2.
     np.testing.assert_allclose(epsilons, [0.9, 0.7, 0.5, 0.3, 0.1, 0.1], rtol=1e-5)
 
 
-# --- exploration ---------------------------------------------------------------------------------
-
-
 def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise():
-    agent, obs = make_ddqn(CONFIG, OBS_DIM, num_actions=3), np.float32([0.3, -0.2, 0.5])
+    agent, obs = DDQN(CONFIG, OBS_DIM, num_actions=3).agent(), np.float32([0.3, -0.2, 0.5])
     state = jax.jit(agent.init)(jax.random.key(0), agent.hparams).replace(epsilon=np.float32(0.3))
     drawn, tested = drawing(agent)(state, obs)
     template = shapes_of(CONFIG.network(3).init, jax.random.key(0), obs)
@@ -187,31 +132,3 @@ def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise():
     best = np.argmax(numpy_forward(params, obs, CONFIG.activation, CONFIG.num_layers))
     assert (tested == best).all()
     assert_shares(drawn, 0.1 + 0.7 * np.eye(3)[best])  # random ones are uniform
-
-
-# --- probe ---------------------------------------------------------------------------------------
-
-
-def test_a_two_step_probe_learns_gamma_and_one():
-    # A -> B with reward 0, B -> end with reward 1, whatever the action. Hence Q(B) = 1, as nothing
-    # follows, and Q(A) = 0 + gamma * Q(B) = gamma. The end looks like A: bootstrapping there
-    # would be seen.
-    gamma = 0.7
-    config = replace(
-        CONFIG, hidden_size=8, num_layers=1, learning_rate=0.02, discount=gamma, activation="tanh"
-    )
-    agent = make_ddqn(config, obs_dim=2, num_actions=2)
-    a, b = [1.0, 0.0], [0.0, 1.0]
-    batch = Transition(
-        obs=np.float32([a, a, b, b]).T,
-        action=np.int32([0, 1, 0, 1]),
-        reward=np.float32([0.0, 0.0, 1.0, 1.0]),
-        discount=np.float32([1.0, 1.0, 0.0, 0.0]),
-        next_obs=np.float32([b, b, a, a]).T,
-    )
-    learned = jax.jit(lambda: train_on(agent, batch, 600).params)
-    template = shapes_of(MLP(2, 8, 1, "tanh").init, jax.random.key(0), np.zeros(2))
-    params = unraveled(learned(), template)["params"]
-    for state, value in ((a, gamma), (b, 1.0)):
-        q_values = numpy_forward(params, state, "tanh", 1)
-        np.testing.assert_allclose(q_values, [value, value], atol=0.02)

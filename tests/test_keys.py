@@ -87,32 +87,6 @@ def test_each_word_is_uniform(drawn):
             assert abs(chi_square - 255) < 5.5 * np.sqrt(510)
 
 
-def test_no_bit_follows_another_of_its_step_or_of_the_next(drawn):
-    for of_loop in drawn[:, :3000].reshape(len(LOOPS), 3000, -1):
-        bits = np.unpackbits(of_loop.view(np.uint8), axis=1).astype(np.float32) * 2 - 1
-        pairs = np.concatenate([bits[:-1], bits[1:]], axis=1)  # [step, 2 * 384]
-        correlations = pairs.T @ pairs / len(pairs)
-        np.fill_diagonal(correlations, 0)
-        # 295,000 pairs: the largest of as many normal numbers is 5 standard deviations, seldom 6.5.
-        assert np.abs(correlations).max() < 6.5 / np.sqrt(len(pairs))
-
-
-def test_each_bit_of_the_loops_key_moves_half_of_every_word():
-    key = np.array([0x12345678, 0x9ABCDEF0], np.uint32)
-    flips = [flip for i in range(32) for flip in ([1 << i, 0], [0, 1 << i])]
-    flipped = key ^ np.array(flips, np.uint32)
-    steps = jnp.arange(200)
-    keys = jax.random.wrap_key_data(jnp.concatenate([key[None], flipped]))
-    plain, *others = jax.jit(jax.vmap(jax.vmap(data_of, (None, 0)), (0, None)))(keys, steps)
-    plain = np.asarray(plain)
-    for i, other in enumerate(np.asarray(others)):
-        moved = np.unpackbits((plain ^ other).view(np.uint8), axis=-1).reshape(*plain.shape, 32)
-        share = moved.mean(axis=(0, 1, 3))  # of the first words and of the second
-        # The high half of the key is in the second words alone.
-        assert abs(share[1] - 0.5) < 0.02
-        assert share[0] == 0 if i % 2 else abs(share[0] - 0.5) < 0.02
-
-
 # --- as keys of JAX ------------------------------------------------------------------------------
 
 

@@ -82,12 +82,6 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     assert len(np.unique(candidates[:6:2], axis=0)) == 3
 
 
-def test_without_mirroring_there_is_no_minus_half():
-    candidates, _, _ = asked(mirrored=False)
-    assert candidates.shape == (3 + 3, DIMS)
-    np.testing.assert_array_equal(candidates[3:], np.tile(MEAN, (3, 1)))
-
-
 def test_the_noise_is_normal_with_the_configured_std():
     strategy = NESConfig(population_size=50, noise_std=0.05).make(400)
     state = strategy.init(jax.random.key(0), jnp.zeros(400))
@@ -100,15 +94,6 @@ def test_the_noise_is_normal_with_the_configured_std():
 
 
 # --- the sign ------------------------------------------------------------------------------------
-
-
-def test_each_member_moves_the_mean_by_its_better_sign():
-    # Members 0, 1, 2: plus 5, 1, 2; minus 3, 4, 2. Better: plus, minus, and plus for the tie.
-    state, candidates = told([5, 1, 2, 3, 4, 2, 0, 0, 0], score_transform="linear")
-    # linear on 5, 4, 2: 1, 2/3, 0.
-    noise = candidates[:3] - MEAN
-    expected = MEAN + 1.0 * noise[0] - 2 / 3 * noise[1]
-    np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("diverged", [NAN, INF, -INF])

@@ -45,14 +45,6 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
             assert abs(values.var() / (bound**2 / 3) - 1) < tolerance
 
 
-def test_layers_are_initialised_independently():
-    net = MLP(num_outputs=8, hidden_size=8, num_layers=2, activation="relu")
-    params = jax.jit(net.init)(jax.random.key(0), np.zeros(8, np.float32))["params"]
-    kernels = [np.asarray(params[f"Dense_{i}"]["kernel"]).ravel() for i in range(3)]
-    correlations = np.corrcoef(kernels)[np.triu_indices(3, 1)]
-    assert np.abs(correlations).max() < 5 / np.sqrt(64)
-
-
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_forward_equals_a_numpy_loop(activation, num_layers):

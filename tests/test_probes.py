@@ -57,8 +57,6 @@ ACTOR_CRITIC = OFF_POLICY | {
 }  # fmt: skip
 AGENTS = {
     "ddqn": sejax.DDQNConfig(**OFF_POLICY),
-    "dueling_ddqn": sejax.DuelingDDQNConfig(**OFF_POLICY, feature_dim=16, stream_hidden_size=16),
-    "dqn": sejax.DQNConfig(**OFF_POLICY, train_every=2, gradient_steps=2),
     "td3": sejax.TD3Config(**ACTOR_CRITIC),
     "td3_discrete": sejax.DiscreteTD3Config(
         **OFF_POLICY, target_noise_std=0.0, final_temperature=1.0
@@ -99,14 +97,6 @@ def test_a_bandits_best_action_is_found(name, kind):
 
 SOLVED = TrainingConfig(max_episodes=1000, stop_rule="solved", solved_by="train", max_steps=50_000)
 CURVES = {  # task, agent, training, and the least mean test return
-    "dueling_ddqn": (
-        "cartpole",
-        sejax.DuelingDDQNConfig(
-            hidden_size=64, num_layers=1, feature_dim=64, stream_hidden_size=64
-        ),
-        SOLVED,
-        180,
-    ),
     "td3_discrete": ("cartpole", sejax.DiscreteTD3Config(), SOLVED, 195),
     "td3": (
         "pendulum",

@@ -7,7 +7,7 @@ import pytest
 from support import large_ops_in_loops, paper_se, paper_training
 
 from sejax import envs
-from sejax.agents.dqn import DDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.options import registry
 from sejax.proxies.reward import RewardConfig
 from sejax.training import make_trainer
@@ -23,7 +23,7 @@ def case():
     config = DDQNConfig(
         hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1, buffer_size=CAPACITY
     )
-    agent = make_ddqn(config, 4, 2)
+    agent = DDQN(config, 4, 2).agent()
     train = make_trainer(agent, env, paper_training(max_episodes=MAX_EPISODES, window=2))
     params = env.params(env.init_weights(jax.random.key(0))).replace(
         max_steps_in_episode=jnp.int32(5)
@@ -92,7 +92,7 @@ def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     # An RN's agent of the paper has room for a million, of which its training can fill 20,000.
     task = envs.make("cartpole")
     env = RewardConfig().make(task)
-    agent = make_ddqn(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions)
+    agent = DDQN(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions).agent()
     training = paper_training(max_episodes=100, stop_rule="never")
     key = jax.random.key(0)
     program = str(jax.make_jaxpr(make_trainer(agent, env, training))(key, env.default_params))

@@ -1,4 +1,4 @@
-"""sejax.agents.sac: updates against torch, a density by hand, acting, probe MDPs."""
+"""sejax.agents.sac: updates against torch, a density by hand, acting."""
 
 import functools
 from dataclasses import replace
@@ -14,19 +14,15 @@ from support import (
     numpy_forward,
     random_columns,
     shapes_of,
-    train_on,
     unraveled,
 )
 
 from sejax.agents.buffers import Transition
 from sejax.agents.sac import (
+    SAC,
+    DiscreteSAC,
     LearningNoise,
     SACConfig,
-    gaussian_policy,
-    make_learning_step,
-    make_networks,
-    make_sac,
-    softmax_policy,
     squashed_gaussian,
 )
 
@@ -49,24 +45,22 @@ CHECKED_UPDATES = (1, 3)
 WEIGHT = np.float32(np.arange(BATCH) < BATCH - 1)
 
 
-def policy_of(case):
-    return softmax_policy(ACTION_DIM) if CASES[case][0] else gaussian_policy(ACTION_DIM, MAX_ACTION)
+@functools.cache
+def sac_of(case):
+    discrete, config = CASES[case]
+    kind = DiscreteSAC if discrete else SAC
+    return kind(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
 
 
 @functools.cache
 def agent_of(case):
-    return make_sac(CASES[case][1], OBS_DIM, policy_of(case))
-
-
-@functools.cache
-def networks_of(case):
-    return make_networks(CASES[case][1], OBS_DIM, policy_of(case))
+    return sac_of(case).agent()
 
 
 @functools.cache
 def learn_of(case):
     """The jitted learning step, `(state, batch, noise) -> state`."""
-    return jax.jit(make_learning_step(networks_of(case), policy_of(case)))
+    return jax.jit(sac_of(case).learn)
 
 
 @functools.cache
@@ -82,8 +76,7 @@ def state_of(case):
 
 def nested(case, state):
     """A state's parameters as `Params`, and its target critics, by layer."""
-    networks = networks_of(case)
-    like = jax.eval_shape(networks.unflatten, state.params)
+    like = jax.eval_shape(sac_of(case).unflatten, state.params)
     return unraveled(state.params, like), unraveled(state.target_critics, like.critics)
 
 
@@ -140,7 +133,7 @@ def test_target_critics_start_as_copies_and_the_critics_apart():
     case = "discrete"
     agent = agent_of(case)
     fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-    critics_of = networks_of(case).critics_of
+    critics_of = sac_of(case).critics_of
     np.testing.assert_array_equal(fresh.target_critics, critics_of(fresh.params))
     np.testing.assert_allclose(fresh.params[-1], np.log(0.3), rtol=1e-6)
     pair = nested(case, fresh)[0].critics["params"]["Dense_0"]["kernel"]
@@ -189,38 +182,3 @@ def test_the_first_episodes_are_for_warming_up_uniformly(case):
 def test_the_world_takes_continuous_actions_in_its_own_units():
     action = agent_of("continuous").env_action(jnp.float32([0.5, -1.0]))
     np.testing.assert_array_equal(action, [1.0, -2.0])
-
-
-# --- probes --------------------------------------------------------------------------------------
-
-
-def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
-    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
-    # ends it with 1 and action 1 with 0. With alpha 0.5 and gamma 0.8 the best policy is
-    # softmax(Q / alpha) and a state's value alpha log sum exp(Q / alpha): V(B) = 0.5 ln(e^2 + 1) =
-    # 1.0635, Q(A) = [0.5, 0.8 * 1.0635] and so on. The end looks like A: bootstrapping there would
-    # show.
-    alpha, gamma = 0.5, 0.8
-    config = SACConfig(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.02,
-                       tau=0.1, discount=gamma, alpha=alpha)  # fmt: skip
-    policy = softmax_policy(2)
-    agent, networks = make_sac(config, 2, policy), make_networks(config, 2, policy)
-    a, b = [1.0, 0.0], [0.0, 1.0]
-    batch = Transition(obs=np.float32([a, a, b, b]).T, action=np.int32([0, 1, 0, 1]),
-                       reward=np.float32([0.5, 0.0, 1.0, 0.0]),
-                       discount=np.float32([0.0, 1.0, 0.0, 0.0]),
-                       next_obs=np.float32([a, b, a, a]).T)  # fmt: skip
-
-    @jax.jit
-    def learned():
-        params = networks.unflatten(train_on(agent, batch, 500).params)
-        states = np.eye(2, dtype=np.float32)  # columns: A and B
-        policy = jax.nn.softmax(networks.actor(params, states), axis=0)
-        return networks.critics(params.critics, states), policy
-
-    value_b = alpha * np.log(np.exp(1 / alpha) + 1)
-    q_values = np.array([[0.5, 1.0], [gamma * value_b, 0.0]])  # [action, state]
-    expected = np.exp(q_values / alpha) / np.exp(q_values / alpha).sum(axis=0)
-    got, policy = learned()
-    np.testing.assert_allclose(got, np.stack([q_values] * 2), atol=0.03)
-    np.testing.assert_allclose(policy, expected, atol=0.03)

@@ -10,7 +10,7 @@ from support import assert_shares, drawing, paper_training
 
 from sejax import envs
 from sejax.agents.buffers import Transition
-from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, Tabular
 from sejax.evaluation import make_tester
 from sejax.training import make_trainer
 
@@ -21,7 +21,7 @@ NUMBERS = {"learning_rate": 0.5, "discount": 0.9, "epsilon_init": 0.4, "epsilon_
 
 @functools.cache
 def q_learning(num_states=NUM_STATES, num_actions=NUM_ACTIONS, config=QLearningConfig, **numbers):
-    return make_tabular(config(**{**NUMBERS, **numbers}), num_states, num_actions)
+    return Tabular(config(**{**NUMBERS, **numbers}), num_states, num_actions).agent()
 
 
 sarsa = functools.partial(q_learning, config=SARSAConfig)
@@ -199,7 +199,7 @@ def trained(agent, task, num_episodes, num_agents):
 
 def test_q_learning_finds_the_shortest_way_along_the_cliff_and_never_undervalues():
     task = envs.make("cliff_walking")  # with the paper's numbers
-    agent = make_tabular(QLearningConfig(), task.num_states, task.num_actions)
+    agent = Tabular(QLearningConfig(), task.num_states, task.num_actions).agent()
     result, returns = trained(agent, task, num_episodes=300, num_agents=6)
     np.testing.assert_array_equal(returns, -12.0)  # 13 steps, the last of which is free
     assert not result.nonfinite.any()
@@ -213,22 +213,3 @@ def test_q_learning_finds_the_shortest_way_along_the_cliff_and_never_undervalues
     assert (values >= expected - 1e-4).all()
     way = [36, *range(24, 36)]  # up, along the cliff's edge, and down
     np.testing.assert_allclose(values[:, way], np.tile(expected[way], (6, 1)), atol=1e-4)
-
-
-@pytest.mark.parametrize(("make", "worth"), [(q_learning, 1.0), (sarsa, 0.8)])
-def test_sarsa_values_its_own_exploration_and_q_learning_the_best_action(make, worth):
-    # 0 -> 1 for nothing; from 1 action 0 earns 1 and action 1 nothing. With epsilon 0.4 the policy
-    # earns 0.6 * 1 + 0.4 * 0.5 = 0.8 there on average, the best action 1.
-    agent = make(2, 2, learning_rate=0.05)
-    state = started(agent, [[0.0, 0.0], [1.0, 0.0]])
-
-    def learn(key):
-        def body(state, key):
-            return agent.update(key, state, step(0, 0, 0.0, 1.0, 1)), None
-
-        return jax.lax.scan(body, state, jax.random.split(key, 300))[0]
-
-    values = jax.jit(jax.vmap(learn))(jax.random.split(KEY, 400)).q_values
-    values = np.asarray(values)[:, 0, 0]
-    error = np.std(values) / np.sqrt(values.size)
-    np.testing.assert_allclose(np.mean(values), 0.9 * worth, atol=5 * error + 1e-5)

@@ -1,4 +1,4 @@
-"""sejax.agents.td3: updates against torch, noise, exploration, Gumbel-Softmax, probe MDPs."""
+"""sejax.agents.td3: updates against torch, noise, exploration, Gumbel-Softmax."""
 
 import functools
 from dataclasses import replace
@@ -8,21 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import drawing, numpy_forward, random_columns, raveled, shapes_of, train_on, unraveled
+from support import drawing, numpy_forward, random_columns, raveled, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
+    TD3,
+    DiscreteTD3,
     DiscreteTD3Config,
     LearningNoise,
     TD3Config,
     annealed_temperature,
-    draw_learning_noise,
     gumbel_softmax,
-    gumbel_softmax_policy,
-    make_learning_step,
-    make_networks,
-    make_td3,
-    tanh_policy,
 )
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
@@ -53,15 +49,16 @@ def is_discrete(config):
     return isinstance(config, DiscreteTD3Config)
 
 
-def policy_of(config):
+@functools.cache
+def td3_of(config):
     if is_discrete(config):
-        return gumbel_softmax_policy(ACTION_DIM, config.temperature_steps, config.one_hot_actions)
-    return tanh_policy(ACTION_DIM, MAX_ACTION)
+        return DiscreteTD3(config, OBS_DIM, ACTION_DIM, 1.0)
+    return TD3(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
 
 
 @functools.cache
 def agent_of(config):
-    return make_td3(config, OBS_DIM, policy_of(config))
+    return td3_of(config).agent()
 
 
 @functools.cache
@@ -81,8 +78,7 @@ def state_with(config, params):
 @functools.cache
 def learn_of(config):
     """The jitted learning step, `(state, batch, noise) -> state`."""
-    networks = make_networks(config, OBS_DIM, ACTION_DIM)
-    return jax.jit(make_learning_step(config, networks, policy_of(config)))
+    return jax.jit(td3_of(config).learn)
 
 
 def case_batch(config, seed):
@@ -167,14 +163,14 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
     n = 20_000
-    noise = draw_learning_noise(jax.random.key(0), policy_of(DISCRETE), (1, n))
+    noise = td3_of(DISCRETE).draw_noise(jax.random.key(0), (1, n))
     x = np.concatenate(noise)  # [3, n]
     # Standard Gumbel: mean 0.5772, variance pi^2 / 6.
     variance = np.array([1.0, np.pi**2 / 6, np.pi**2 / 6])
     assert (np.abs(x.mean(1) - [0.0, 0.57722, 0.57722]) < 5 * np.sqrt(variance / n)).all()
     np.testing.assert_allclose(x.var(1), variance, rtol=0.1)
     assert np.abs(np.corrcoef(x)[np.triu_indices(3, 1)]).max() < 5 / np.sqrt(n)
-    assert draw_learning_noise(jax.random.key(0), policy_of(CONFIG), (1, 2)).policy is None
+    assert td3_of(CONFIG).draw_noise(jax.random.key(0), (1, 2)).policy is None
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
@@ -197,7 +193,7 @@ def test_gumbel_softmax_by_hand():
 
 
 def test_a_final_temperature_of_zero_gives_finite_samples_and_gradients():
-    hparams = agent_of(DISCRETE).hparams._replace(final_temperature=0.0)
+    hparams = agent_of(DISCRETE).hparams.replace(final_temperature=0.0)
     gumbel, weights = np.float32([-2.0, 17.0, 0.0]), np.float32([1.0, 2.0, 3.0])
 
     @jax.jit
@@ -227,7 +223,7 @@ def acting_state_of(config):
 def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
     """Actions of 4000 keys, `[4000, action_dim]`."""
     state, agent = acting_state_of(config), agent_of(config)
-    hparams = state.hparams._replace(action_noise_std=np.float32(action_noise_std))
+    hparams = state.hparams.replace(action_noise_std=np.float32(action_noise_std))
     state = agent.begin_episode(state.replace(hparams=hparams), np.int32(2 if warming_up else 3))
     return np.asarray(drawing(agent)(state, OBS)[0 if explore else 1])
 
@@ -302,43 +298,3 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
         drawn_actions(noisy, explore=False, warming_up=True), drawn_actions(config, explore=True),
         rtol=1e-5, atol=1e-6,
     )  # fmt: skip
-
-
-# --- probes --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("one_hot", [False, True], ids=["relaxed", "one_hot"])
-def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(one_hot):
-    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
-    # ends it with 1 and action 1 with 0. With gamma 0.8 waiting is worth 0.8: Q(A) = [0.5, 0.8],
-    # Q(B) = [1, 0], policy 1 in A and 0 in B. The end looks like A: bootstrapping there would show.
-    # The actions are such as the policy gives, as critics are wild where they have seen nothing.
-    config = DiscreteTD3Config(
-        hidden_size=16, num_layers=2, learning_rate=0.003, tau=0.1, discount=0.8,
-        target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
-    )  # fmt: skip
-    agent = make_td3(config, 2, gumbel_softmax_policy(2, config.temperature_steps, one_hot))
-    networks = make_networks(config, 2, 2)
-    gumbel = np.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
-    taken, in_a = np.argmax(gumbel, axis=0), np.arange(64) % 2 == 0
-    waits = in_a & (taken == 1)
-    states = np.float32([[1, 0], [0, 1]])  # columns: A and B
-
-    @jax.jit
-    def run(key):
-        batch = Transition(
-            obs=np.where(in_a, states[:, :1], states[:, 1:]),
-            action=gumbel_softmax(jnp.zeros((2, 64)), gumbel, 0.3, one_hot),
-            reward=np.float32(np.where(taken == 0, np.where(in_a, 0.5, 1.0), 0.0)),
-            discount=np.float32(waits),
-            next_obs=np.where(waits, states[:, 1:], states[:, :1]),
-        )
-        state = train_on(agent, batch, 1000)
-        actions = [agent.env_action(agent.act(key, state, obs, explore=False)) for obs in states.T]
-        pairs = np.repeat(states, 2, axis=1), np.tile(np.eye(2, dtype=np.float32), 2)
-        return actions, [networks.critic(critic, *pairs) for critic in state.critics]
-
-    actions, q_values = run(jax.random.key(0))
-    assert [int(action) for action in actions] == [1, 0]
-    for got in q_values:
-        np.testing.assert_allclose(got, [0.5, 0.8, 1.0, 0.0], atol=0.1)

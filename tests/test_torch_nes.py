@@ -39,15 +39,3 @@ def test_an_update_equals_sejaxs_on_the_same_noise_and_scores(changes, scores):
     got = torch_nes.nes_update(psi, noise, np.concatenate([signed, incumbent]), config)
     np.testing.assert_allclose(got, strategy.incumbent(told), rtol=1e-4, atol=1e-5)
     assert (got != psi).any() == (scores != "none better" or config.weight_decay > 0)
-
-
-def test_weights_come_back_from_a_vector():
-    rng = np.random.default_rng(0)
-    layers = [{"kernel": rng.normal(size=(2, 3)), "bias": rng.normal(size=3)} for _ in range(4)]
-    weights = {"reward": dict(zip("ab", layers[:2], strict=True)),
-               "done": dict(zip("ab", layers[2:], strict=True))}  # fmt: skip
-    flat, unravel = torch_nes.ravel(weights)
-    assert flat.shape == (36,)
-    jax.tree.map(np.testing.assert_allclose, unravel(flat), weights)
-    moved = unravel(np.arange(36.0))
-    assert sorted(x for leaf in jax.tree.leaves(moved) for x in leaf.ravel()) == list(range(36))

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from support import paper_se, random_columns
 
 from sejax.agents.buffers import Transition
-from sejax.agents.dqn import DDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.ops.networks import MLP
 from sejax.training import TrainingConfig
 
@@ -33,7 +33,7 @@ def torch_network(params):
 
 
 def test_updates_equal_sejaxs_on_the_same_batches():
-    agent = make_ddqn(CONFIG, OBS_DIM, NUM_ACTIONS)
+    agent = DDQN(CONFIG, OBS_DIM, NUM_ACTIONS).agent()
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     update = jax.jit(agent.update)
     torch_state = reference.ddqn_state(torch_network(state.params))

@@ -14,10 +14,7 @@ from sejax.training import TrainingConfig, make_trainer
 
 SMALL = {"torso": "conv", "num_filters": 4, "num_layers": 1, "hidden_size": 16}
 AGENTS = {
-    "dqn": sejax.DQNConfig(**SMALL, batch_size=16, warmup_episodes=20, exploration_steps=100),
     "ddqn": sejax.DDQNConfig(**SMALL, batch_size=16, warmup_episodes=20),
-    "dueling_ddqn": sejax.DuelingDDQNConfig(**SMALL, batch_size=16, warmup_episodes=20,
-                                            feature_dim=8, stream_hidden_size=8),
     "ppo": sejax.PPOConfig(**SMALL, rollout_steps=64),
 }  # fmt: skip
 IMAGE = (4, 5, 2)

@@ -6,7 +6,7 @@ from support import raveled
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, nested_params, random_batch
 from torch_networks import TorchMLP, follow, tensors, write_golden
 
-from sejax.agents.dqn import make_ddqn
+from sejax.agents.dqn import DDQN
 
 
 class TorchDDQN:
@@ -53,7 +53,7 @@ def write(path, configs, make_reference):
     """Writes parameters before, after one, and after five updates on the test's batches."""
     references = {}
     for case, config in configs.items():
-        agent, nested = make_ddqn(config, OBS_DIM, NUM_ACTIONS), nested_params(config)
+        agent, nested = DDQN(config, OBS_DIM, NUM_ACTIONS).agent(), nested_params(config)
         params = agent.init(jax.random.key(1), agent.hparams).params
         # Target and online network apart from the start, so that it shows which is used where.
         references[case] = make_reference(nested(params), nested(params[::-1]), config)

@@ -7,48 +7,26 @@ hyperparameters that compiled programs take as arguments, and the buffers.
 import dataclasses
 import functools
 
-from sejax.agents.base import (
-    Agent,
-    AgentConfig,
-    AgentOptions,
-    AgentSpec,
-    ExplorationConfig,
-    NoExploration,
-    Spaces,
-    traced,
-)
-from sejax.agents.buffers import (
-    Buffer,
-    Rollout,
-    Transition,
-    no_buffer,
-    replay_buffer,
-    rollout_buffer,
-)
+from sejax.agents.base import Agent as Agent
+from sejax.agents.base import AgentConfig as AgentConfig
+from sejax.agents.base import AgentOptions as AgentOptions
+from sejax.agents.base import AgentSpec as AgentSpec
+from sejax.agents.base import ExplorationConfig as ExplorationConfig
+from sejax.agents.base import Hparams as Hparams
+from sejax.agents.base import NoExploration as NoExploration
+from sejax.agents.base import Spaces
+from sejax.agents.base import traced as traced
+from sejax.agents.buffers import Buffer as Buffer
+from sejax.agents.buffers import Rollout as Rollout
+from sejax.agents.buffers import Transition as Transition
+from sejax.agents.buffers import no_buffer as no_buffer
+from sejax.agents.buffers import replay_buffer as replay_buffer
+from sejax.agents.buffers import rollout_buffer as rollout_buffer
 from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import nearest, registry, require, shortened
+from sejax.options import registry, require, shortened
 from sejax.options.parts import require_part
-
-__all__ = [
-    "Agent",
-    "AgentConfig",
-    "AgentOptions",
-    "AgentSpec",
-    "Buffer",
-    "ExplorationConfig",
-    "NoExploration",
-    "Rollout",
-    "Transition",
-    "make_agent",
-    "names",
-    "no_buffer",
-    "replay_buffer",
-    "require_fit",
-    "rollout_buffer",
-    "traced",
-]
 
 DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
 
@@ -99,9 +77,7 @@ def _make_agent(
         return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, spaces=spaces))
 
     spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
-    if not varied:
-        return make(config)
-    return make_varied(config, make)
+    return make_varied(config, make) if varied else make(config)
 
 
 _make_once = functools.cache(_make_agent)
@@ -121,9 +97,8 @@ def require_fit(
     Raises:
       ConfigError: if it cannot.
     """
-    for value, cls in ((agent, AgentConfig), (exploration, ExplorationConfig)):
-        fix = f"Set {cls.group}={_object_of(cls.group, value)}."
-        require_part(cls.group, cls, value, fix)
+    require_part("agent", AgentConfig, agent, "Pass an object, such as DDQNConfig().")
+    require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
@@ -135,24 +110,11 @@ def require_fit(
         )
     exploration_name = shortened(registry.name_of("exploration", exploration))
     require(
-        agent.learns_each_step or not exploration.needs_each_step,
-        "exploration",
-        "must be none where the agent's train_every or gradient_steps is not 1; got "
-        f"{exploration_name}. Set exploration=none, or both of these to 1.",
-    )
-    require(
         exploration.states is None or agent.states in (None, exploration.states),
         "exploration",
         f"must be one for {agent.states} states with agent={shortened(agent_name)}; got "
         f"{exploration_name}. Set exploration=none.",
     )
-
-
-def _object_of(group: str, value: object) -> str:
-    """What to write for a class, or for the name of one."""
-    name = nearest(value, registry.names(group))[0]
-    cls = value if isinstance(value, type) else registry.find(group, name)
-    return f"{cls.__name__}()"
 
 
 def default_for(spec: TaskSpec) -> str:

@@ -1,8 +1,10 @@
 """The contract of an agent: a bundle of pure functions over one agent's state."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, NoReturn, Protocol, TypeAlias, TypeVar
+from types import SimpleNamespace
+from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import jax
 from flax import linen as nn
@@ -11,14 +13,36 @@ from jaxtyping import Array, Int, PyTree
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, spaces_of
-from sejax.envs.spec import Discrete, Space
+from sejax.envs.spec import Discrete
 from sejax.ops.networks import OnImages
 from sejax.options import Options, counts, one_of, option, require, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
-Hparams: TypeAlias = PyTree  # traced hyperparameters of an agent, a named tuple: see `traced`
-Number: TypeAlias = Array | float
+
+
+@jax.tree_util.register_pytree_node_class
+class Hparams(SimpleNamespace):
+    """Traced hyperparameters of an agent, a pytree; see `traced`.
+
+    Attributes:
+      hidden_size: units in use, where they vary; None for all.
+      batch_size: columns of a batch in use, likewise.
+    """
+
+    hidden_size: Array | None = None
+    batch_size: Array | None = None
+
+    def replace(self, **values: PyTree) -> Self:
+        """The same hyperparameters but for these."""
+        return type(self)(**vars(self) | values)
+
+    def tree_flatten(self) -> tuple[tuple[PyTree, ...], tuple[str, ...]]:
+        return tuple(vars(self).values()), tuple(vars(self))
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values: tuple[PyTree, ...]) -> Self:
+        return cls(**dict(zip(names, values, strict=True)))
 
 
 class ActFn(Protocol):
@@ -45,10 +69,7 @@ class Spaces(NamedTuple):
     @classmethod
     def of_env(cls, env: Environment) -> "Spaces":
         """Those of an environment, or of a proxy."""
-        return cls.of_spaces(*spaces_of(env))
-
-    @classmethod
-    def of_spaces(cls, observation: Space, action: Space) -> "Spaces":
+        observation, action = spaces_of(env)
         return cls(
             num_states=observation.n if isinstance(observation, Discrete) else None,
             obs_dim=observation.size,
@@ -143,9 +164,7 @@ class Agent:
         return {} if self.varied is None else self.varied.draw(drawing_key(key)).values
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True)
-class Draw:
+class Draw(NamedTuple):
     """Hyperparameters of one training.
 
     Attributes:
@@ -159,8 +178,7 @@ class Draw:
     values: dict[str, Array]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Varied:
+class Varied(NamedTuple):
     """Hyperparameters that are drawn for each training; see `sejax.agents.varied`.
 
     Attributes:
@@ -189,11 +207,6 @@ class AgentConfig(Options):
     group: ClassVar[str] = "agent"
     states: ClassVar[str | None] = None
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
-
-    @property
-    def learns_each_step(self) -> bool:
-        """Whether each step has one learning step, as ICM needs it."""
-        return True
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
@@ -277,12 +290,10 @@ class ExplorationConfig(Options):
 
     Attributes:
       states: the observations of the agents that it fits, "vector" or "discrete"; None for both.
-      needs_each_step: whether the agent must learn once at each step.
     """
 
     group: ClassVar[str] = "exploration"
     states: ClassVar[str | None] = None
-    needs_each_step: ClassVar[bool] = False
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the intrinsic reward."""
@@ -297,23 +308,70 @@ class NoExploration(ExplorationConfig):
         return agent
 
 
-def traced(config: Options, cls: type[T]) -> T:
-    """A configuration's traced hyperparameters.
-
-    Args:
-      config: a dataclass, some of whose options are `traced`.
-      cls: a named tuple whose fields have their names; other fields keep their defaults.
+def traced(config: Options) -> Hparams:
+    """A configuration's traced hyperparameters, by the names of its fields.
 
     Example:
-      >>> from sejax.agents.tabular import QLearningConfig, TabularHparams
-      >>> traced(QLearningConfig(), TabularHparams).discount
+      >>> from sejax.agents.tabular import QLearningConfig
+      >>> traced(QLearningConfig()).discount
       0.8
     """
-    return cls(**traced_options(config))
+    return Hparams(**traced_options(config))
 
 
 def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
     """Traced hyperparameters with these values; those of a wrapped agent are its field `agent`."""
-    if "agent" in hparams._fields:
-        return hparams._replace(agent=with_hparams(hparams.agent, values))
-    return hparams._replace(**values)
+    if hasattr(hparams, "agent"):
+        return hparams.replace(agent=with_hparams(hparams.agent, values))
+    return hparams.replace(**values)
+
+
+class Learner(ABC):
+    """The pure functions of an agent, which `agent` bundles; an algorithm is a subclass.
+
+    Its state has the traced hyperparameters as `hparams`.
+
+    Attributes:
+      config: with a `discount` among its traced options.
+    """
+
+    config: AgentOptions
+
+    @abstractmethod
+    def init(self, key: Array, hparams: Hparams) -> AgentState:
+        """A fresh agent."""
+
+    @abstractmethod
+    def act(self, key: Array, state: AgentState, obs: Array, explore: bool) -> Array:
+        """The action for one observation."""
+
+    @abstractmethod
+    def update(self, key: Array, state: AgentState, batch: PyTree) -> AgentState:
+        """One learning step."""
+
+    def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
+        """Applies schedules that move with episodes."""
+        return state
+
+    def env_action(self, action: Array) -> Array:
+        """An action as the environment takes it."""
+        return action
+
+    @abstractmethod
+    def buffer(self) -> BufferMaker:
+        """How steps are kept."""
+
+    def agent(self) -> Agent:
+        """The bundle of these functions."""
+        return Agent(
+            init=self.init,
+            act=self.act,
+            update=self.update,
+            buffer=self.buffer(),
+            hparams=traced(self.config),
+            spec=self.config.spec(),
+            begin_episode=self.begin_episode,
+            env_action=self.env_action,
+            discount=lambda hparams: hparams.discount,
+            batch_size=lambda state: state.hparams.batch_size,
+        )

@@ -238,7 +238,7 @@ def sample(
       num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
       batch_size: number of rows to draw (static).
       action_dim: length of an action, or None if it is an index.
-      in_use: draw only the first so many of the columns, `[]`; None for all of them.
+      in_use: how many of the columns count, `[]`; None for all of them.
 
     Returns:
       A batch whose width is `batch_size` rounded up to whole vectors of the CPU, or with `in_use`
@@ -246,34 +246,19 @@ def sample(
 
     Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
     """
-    size = jnp.minimum(num_stored, rows.shape[0])
     width = rows.shape[1]
-
-    def columns(first: Array | int, count: int) -> Float[Array, "width count"]:
-        index = sample_indices(seed, size, count, first)[None, :] * width
-        return jax.lax.platform_dependent(
-            rows.reshape(-1),
-            index + jnp.arange(width)[:, None],
-            cpu=_gather_outlined,
-            default=_gather,
-        )
-
-    if in_use is None:
-        padded_size = cpu.whole_vectors(batch_size)
-        batch = columns(0, padded_size)
-        is_padding = jnp.arange(padded_size) >= batch_size
-        weight = 1.0 if padded_size == batch_size else 1.0 - is_padding
-    else:
-        step = block_size(batch_size)
-        padded_size = -(-batch_size // step) * step
-
-        def draw_block(i: Array, batch: Array) -> Array:
-            return jax.lax.dynamic_update_slice(batch, columns(i * step, step), (0, i * step))
-
-        num_blocks = jnp.ceil(in_use / step).astype(jnp.int32)
-        empty = jnp.zeros((width, padded_size), rows.dtype)
-        batch = jax.lax.fori_loop(0, num_blocks, draw_block, empty)
-        weight = jnp.float32(jnp.arange(padded_size) < in_use)
+    step = cpu.VECTOR if in_use is None else block_size(batch_size)
+    padded_size = -(-batch_size // step) * step
+    index = sample_indices(seed, jnp.minimum(num_stored, rows.shape[0]), padded_size)
+    batch = jax.lax.platform_dependent(
+        rows.reshape(-1),
+        index[None, :] * width + jnp.arange(width)[:, None],
+        cpu=_gather_outlined,
+        default=_gather,
+    )
+    num_counted = batch_size if in_use is None else in_use
+    is_whole = in_use is None and padded_size == batch_size
+    weight = 1.0 if is_whole else jnp.float32(jnp.arange(padded_size) < num_counted)
     return unpack(batch, action_dim)._replace(weight=weight)
 
 
@@ -292,15 +277,15 @@ def _gather_outlined(flat: Array, index: Array) -> Array:
 
 
 def sample_indices(
-    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int, first: Array | int = 0
+    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int
 ) -> Int[Array, " batch"]:
-    """Uniform indices in [0, size) of the columns from `first` on: a hash of `seed` and column.
+    """Uniform indices in [0, size): a hash of `seed` and column.
 
     threefry takes half as long as the learning step at these sizes. The hash is the finaliser
     of MurmurHash3 on a Weyl sequence; 24 of its bits choose the index, so that the bias is below
     size / 2**24.
     """
-    counter = jnp.uint32(first) + jnp.arange(batch_size, dtype=jnp.uint32)
+    counter = jnp.arange(batch_size, dtype=jnp.uint32)
     x = murmur(seed + counter * jnp.uint32(0x9E3779B9))
     fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
     index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
@@ -325,7 +310,8 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
 
     Args:
       fn: `batch -> Array`, a sum over the batch's columns in which those of weight 0 count nothing.
-      batch: pytree of arrays whose last axis are the columns; scalars belong to all of them.
+      batch: pytree of arrays whose last axis are the columns, as many as `sample` draws; scalars
+        belong to all of them.
       batch_size: columns that count, from the first on, `[]`; the others must have weight 0. None
         for all, in one go.
 
@@ -334,15 +320,7 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
     """
     if batch_size is None:
         return fn(batch)
-    width = max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x))
-    size = block_size(width)
-    padded = -(-width // size) * size
-
-    def pad(x: Array) -> Array:
-        missing = [(0, 0)] * (jnp.ndim(x) - 1) + [(0, padded - width)]
-        return jnp.pad(x, missing) if jnp.ndim(x) and padded > width else x
-
-    batch = jax.tree.map(pad, batch)
+    size = block_size(max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x)))
 
     def block(index: Array) -> Array:
         def cut(x: Array) -> Array:

@@ -11,7 +11,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, Number, traced
+from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
@@ -31,7 +31,7 @@ from sejax.ops.networks import MLP, Dense
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
 
 
-def _with_bonus(agent: Agent, **changes: Any) -> Agent:
+def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
     """An agent with these changes, whose state and hyperparameters hold those of the one inside.
 
     They are the state's `agent_state` and the hyperparameters' `agent`.
@@ -47,6 +47,7 @@ def _with_bonus(agent: Agent, **changes: Any) -> Agent:
         agent,
         begin_episode=begin_episode,
         act=act,
+        hparams=traced(config).replace(agent=agent.hparams),
         discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
         **changes,
@@ -69,7 +70,6 @@ class ICMConfig(ExplorationConfig):
     """
 
     states: ClassVar[str | None] = "vector"
-    needs_each_step: ClassVar[bool] = True  # its module learns once at each step
 
     learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
     forward_weight: float = option(0.05, fraction(), traced=True)
@@ -85,28 +85,13 @@ class ICMConfig(ExplorationConfig):
         return with_icm(agent, self, task.obs_dim, task.action_dim, is_discrete)
 
 
-class ICMHparams(NamedTuple):
-    """Traced hyperparameters of the module."""
-
-    learning_rate: Number
-    forward_weight: Number
-    reward_scale: Number
-
-
-class CuriousHparams(NamedTuple):
-    """Traced hyperparameters of a curious agent: those of the agent inside, and the module's."""
-
-    agent: Hparams
-    icm: ICMHparams
-
-
 class CuriousState(struct.PyTreeNode):
     """One curious agent: the state of the agent inside, and the module's."""
 
     agent_state: AgentState
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    hparams: ICMHparams
+    hparams: Hparams
 
 
 class ICMOutputs(NamedTuple):
@@ -173,66 +158,6 @@ class ICM(nn.Module):
         )
 
 
-def _learning_of(
-    model: ICM, unflatten: Callable[[Array], PyTree]
-) -> tuple[
-    Callable[[CuriousState, Transition], CuriousState], Callable[[CuriousState, Transition], Array]
-]:
-    """Builds `train(state, batch) -> state`, a step of Adam, and `bonus(state, batch)`."""
-
-    def outputs(params: PyTree, batch: Transition) -> ICMOutputs:
-        action = as_vectors(batch.action, model.action_width)
-        result: Any = model.apply(params, batch.obs, action, batch.next_obs)
-        return result
-
-    def train(state: CuriousState, batch: Transition) -> CuriousState:
-        def loss_fn(params: PyTree) -> Array:
-            beta = state.hparams.forward_weight
-            return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
-
-        gradient = flat.flatten(jax.grad(loss_fn)(unflatten(state.params)))
-        params, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient, state.hparams.learning_rate
-        )
-        return state.replace(params=params, opt_state=opt_state)
-
-    def bonus(state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
-        error = prediction_error(outputs(unflatten(state.params), batch))
-        return state.hparams.reward_scale * jax.lax.stop_gradient(error)
-
-    return train, bonus
-
-
-def _curious_update(
-    agent: Agent,
-    model: ICM,
-    unflatten: Callable[[Array], PyTree],
-    obs_dim: int,
-    is_discrete: bool,
-) -> Callable[[Array, CuriousState, Transition | Rollout], CuriousState]:
-    """Builds the update of `with_icm`."""
-    train_models, bonus = _learning_of(model, unflatten)
-
-    def update(key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
-        if isinstance(batch, Rollout):
-            return update_from_rollout(key, state, batch)
-        state = train_models(state, batch)
-        batch = batch._replace(reward=batch.reward + bonus(state, batch))
-        return state.replace(agent_state=agent.update(key, state.agent_state, batch))
-
-    def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
-        # The agent's update is inside: its rows with the bonus would else be made in each step.
-        def learn(state: CuriousState) -> CuriousState:
-            batch = rollout.transitions(obs_dim, is_discrete)
-            augmented = rollout.with_bonus(bonus(state, batch))
-            state = train_models(state, batch)
-            return state.replace(agent_state=agent.update(key, state.agent_state, augmented))
-
-        return rollout.learn_if_full(learn, state)
-
-    return update
-
-
 def with_icm(
     agent: Agent, config: ICMConfig, obs_dim: int, action_width: int, is_discrete: bool
 ) -> Agent:
@@ -259,42 +184,85 @@ def with_icm(
     Source: `docs/reference.md` 4.8.
 
     Example:
-      >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
-      >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
+      >>> from sejax.agents.dqn import DDQN, DDQNConfig
+      >>> plain = DDQN(DDQNConfig(), obs_dim=4, num_actions=2).agent()
       >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, action_width=2, is_discrete=True)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    model = ICM(config, action_width)
-    example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
-    unflatten = flat.unflattener(model.init, *example)
-
-    def init(key: Array, hparams: CuriousHparams) -> CuriousState:
-        key_agent, key_icm = jax.random.split(key)
-        params = flat.flatten(model.init(key_icm, *example))
-        return CuriousState(
-            agent_state=agent.init(key_agent, hparams.agent),
-            params=params,
-            opt_state=flat.ADAM.init(params),
-            hparams=jax.tree.map(jnp.float32, hparams.icm),
-        )
-
+    curious = Curious(agent, ICM(config, action_width), obs_dim, is_discrete)
     return _with_bonus(
         agent,
-        init=init,
-        update=_curious_update(agent, model, unflatten, obs_dim, is_discrete),
-        hparams=CuriousHparams(agent=agent.hparams, icm=traced(config, ICMHparams)),
+        config,
+        init=curious.init,
+        update=curious.update,
         # The module's networks keep a core busy, whatever the agent's.
         spec=dataclasses.replace(agent.spec, cpu_num_parallel=1),
     )
 
 
+class Curious:
+    """The pure functions of a curious agent."""
+
+    def __init__(self, agent: Agent, model: ICM, obs_dim: int, is_discrete: bool):
+        self.agent, self.model = agent, model
+        self.obs_dim, self.is_discrete = obs_dim, is_discrete
+        self.example = (jnp.zeros(obs_dim), jnp.zeros(model.action_width), jnp.zeros(obs_dim))
+        self.unflatten = flat.unflattener(model.init, *self.example)
+
+    def init(self, key: Array, hparams: Hparams) -> CuriousState:
+        key_agent, key_icm = jax.random.split(key)
+        params = flat.flatten(self.model.init(key_icm, *self.example))
+        return CuriousState(
+            agent_state=self.agent.init(key_agent, hparams.agent),
+            params=params,
+            opt_state=flat.ADAM.init(params),
+            hparams=jax.tree.map(jnp.float32, hparams.replace(agent=None)),
+        )
+
+    def outputs(self, params: Array, batch: Transition) -> ICMOutputs:
+        action = as_vectors(batch.action, self.model.action_width)
+        outputs: Any = self.model.apply(self.unflatten(params), batch.obs, action, batch.next_obs)
+        return outputs
+
+    def train(self, state: CuriousState, batch: Transition) -> CuriousState:
+        """One step of Adam."""
+        hp = state.hparams
+
+        def loss_fn(params: Array) -> Array:
+            outputs = self.outputs(params, batch)
+            return icm_loss(outputs, batch.action, hp.forward_weight, batch.weight)
+
+        gradient = jax.grad(loss_fn)(state.params)
+        params, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient, hp.learning_rate
+        )
+        return state.replace(params=params, opt_state=opt_state)
+
+    def bonus(self, state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
+        error = prediction_error(self.outputs(state.params, batch))
+        return state.hparams.reward_scale * jax.lax.stop_gradient(error)
+
+    def update(self, key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
+        if isinstance(batch, Rollout):
+            # The agent's update is inside: its rows with the bonus would else be made in each step.
+            learn = functools.partial(self.learn, key, rollout=batch)
+            return batch.learn_if_full(learn, state)
+        state = self.train(state, batch)
+        batch = batch._replace(reward=batch.reward + self.bonus(state, batch))
+        return state.replace(agent_state=self.agent.update(key, state.agent_state, batch))
+
+    def learn(self, key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
+        """A learning phase from a full rollout."""
+        batch = rollout.transitions(self.obs_dim, self.is_discrete)
+        augmented = rollout.with_bonus(self.bonus(state, batch))
+        state = self.train(state, batch)
+        return state.replace(agent_state=self.agent.update(key, state.agent_state, augmented))
+
+
 def icm_loss(
-    outputs: ICMOutputs,
-    action: Array,
-    forward_weight: Array | float,
-    weight: Array | float = 1.0,
+    outputs: ICMOutputs, action: Array, forward_weight: Array, weight: Array | float = 1.0
 ) -> Array:
     r"""What the three models minimise together.
 
@@ -316,7 +284,7 @@ def icm_loss(
     Source: Pathak et al. (2017), eq. 2 to 7; `docs/reference.md` 4.8.
     """
     predicted = outputs.predicted_action
-    if _is_index(action):
+    if action.ndim == 1:  # indices
         chosen = as_vectors(action, predicted.shape[0])
         inverse = jax.nn.logsumexp(predicted, axis=0) - jnp.sum(chosen * predicted, axis=0)
     else:
@@ -333,14 +301,9 @@ def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
 
 def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
     """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
-    if not _is_index(action):
+    if action.ndim > 1:
         return action
     return (jnp.arange(width)[:, None] == action[None, :]).astype(jnp.float32)
-
-
-def _is_index(action: Array) -> bool:
-    """Whether a feature-major batch of actions holds indices."""
-    return action.ndim == 1
 
 
 # --- counts --------------------------------------------------------------------------------------
@@ -357,20 +320,13 @@ class CountBasedConfig(ExplorationConfig):
 
     states: ClassVar[str | None] = "discrete"
 
-    reward_scale: float = option(0.1, not_negative("it scales a bonus"))
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"), traced=True)
     count_power: float = option(1.0, positive("the bonus would not fade"))
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""
         assert task.num_states is not None and task.num_actions is not None
         return with_count_bonus(agent, self, task.num_states, task.num_actions)
-
-
-class CountingHparams(NamedTuple):
-    """Traced hyperparameters of a counting agent: those of the agent inside, and the bonus's."""
-
-    agent: Hparams
-    reward_scale: Number  # beta
 
 
 class CountingState(struct.PyTreeNode):
@@ -399,15 +355,15 @@ def with_count_bonus(
       num_actions: number of different actions.
 
     Example:
-      >>> from sejax.agents.tabular import QLearningConfig, make_tabular
-      >>> plain = make_tabular(QLearningConfig(), num_states=48, num_actions=4)
+      >>> from sejax.agents.tabular import QLearningConfig, Tabular
+      >>> plain = Tabular(QLearningConfig(), num_states=48, num_actions=4).agent()
       >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
       0
     """
 
-    def init(key: Array, hparams: CountingHparams) -> CountingState:
+    def init(key: Array, hparams: Hparams) -> CountingState:
         return CountingState(
             agent_state=agent.init(key, hparams.agent),
             counts=jnp.zeros((num_states, num_actions), jnp.int32),
@@ -425,9 +381,4 @@ def with_count_bonus(
             counts=jnp.where(is_visited, count, state.counts),
         )
 
-    return _with_bonus(
-        agent,
-        init=init,
-        update=update,
-        hparams=CountingHparams(agent=agent.hparams, reward_scale=config.reward_scale),
-    )
+    return _with_bonus(agent, config, init=init, update=update)

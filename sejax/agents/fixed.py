@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentSpec, Spaces
+from sejax.agents.base import Agent, AgentSpec, Hparams, Spaces
 from sejax.agents.buffers import no_buffer
 from sejax.envs.base import Task
 
@@ -30,6 +30,6 @@ def make_fixed(task: Task, act: Callable[[Array, Any, Array], Array]) -> Agent:
         act=lambda key, state, obs, /, explore: act(key, state, obs),
         update=lambda key, state, batch: state,
         buffer=no_buffer(),
-        hparams=(),
+        hparams=Hparams(),
         spec=AgentSpec(spaces=Spaces.of_env(task.env)),
     )

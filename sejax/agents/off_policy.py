@@ -12,12 +12,19 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import optax
+from flax import linen as nn
 from jaxtyping import Array, Float, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, AgentState, Hparams, Number
-from sejax.agents.buffers import Transition, num_columns, replay_buffer, sum_over_batch
+from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
+from sejax.agents.buffers import (
+    BufferMaker,
+    Transition,
+    num_columns,
+    replay_buffer,
+    sum_over_batch,
+)
 from sejax.ops import flat
-from sejax.ops.networks import MLP
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -93,31 +100,43 @@ class ActorCriticOptions(OffPolicyOptions):
     def spec(self) -> AgentSpec:
         return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)
 
+
+class OffPolicy(Learner):
+    """An agent that keeps its steps in a ring and learns from batches of them."""
+
+    config: OffPolicyOptions
+
+    def buffer(self) -> BufferMaker:
+        return replay_buffer(self.config.batch_size, self.config.buffer_size)
+
+
+class ActorCritic(OffPolicy):
+    """One that acts at random in its first episodes; its state says so as `is_warming_up`."""
+
     def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
-        """Says whether the agent acts at random, in its state's `is_warming_up`."""
-        return state.replace(is_warming_up=jnp.asarray(episode < self.warmup_episodes))
+        return state.replace(is_warming_up=jnp.asarray(episode < self.config.warmup_episodes))
 
 
-def off_policy_agent(config: OffPolicyOptions, *, batches: int = 1, **functions: Any) -> Agent:
-    """An agent that keeps its steps in a ring and learns from batches of them.
+class FlatNetwork:
+    """A network as functions of its parameters as one vector, which Adam moves fastest.
 
     Args:
-      config: hyperparameters; the agent's state has the traced ones as `hparams`.
-      batches: how many batches `update` takes, side by side.
-      **functions: `init`, `act`, `update`, `hparams` and others of `Agent`.
+      network: for inputs `[num_inputs, *batch]`.
+      num_inputs: of the network.
     """
 
-    def batch_size(state: AgentState) -> Array | None:
-        in_use = state.hparams.batch_size
-        return None if in_use is None else in_use * batches
+    def __init__(self, network: nn.Module, num_inputs: int):
+        self.network, self.num_inputs = network, num_inputs
+        self.unflatten = flat.unflattener(network.init, jnp.zeros(num_inputs))
 
-    return Agent(
-        buffer=replay_buffer(config.batch_size * batches, config.buffer_size),
-        spec=config.spec(),
-        discount=lambda hparams: hparams.discount,
-        batch_size=batch_size,
-        **functions,
-    )
+    def init(self, key: Array, hidden_size: Array | None) -> Float[Array, " num_params"]:
+        """Fresh parameters; `hidden_size` is the number of units in use, or None for all."""
+        return flat.flatten(init_narrowed(self.network, key, self.num_inputs, hidden_size))
+
+    def apply(self, params: Float[Array, " num_params"], x: Array) -> Array:
+        """The outputs, `[out, *batch]`, for `x [in, *batch]`."""
+        outputs: Any = self.network.apply(self.unflatten(params), x)
+        return outputs
 
 
 def adam_step(
@@ -126,7 +145,6 @@ def adam_step(
     opt_state: optax.OptState,
     columns: tuple[Transition, *tuple[PyTree, ...]],
     hparams: Hparams,
-    tree: PyTree = None,
 ) -> tuple[Float[Array, "*params"], optax.OptState]:
     """One step of Adam on a batch's mean loss, at the cost of the columns in use.
 
@@ -136,21 +154,17 @@ def adam_step(
       opt_state: of `flat.ADAM`.
       columns: a batch, and what else has its columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
-      tree: the same parameters as a pytree, if `sum_of_losses` takes them so.
     """
 
-    def gradient(columns: PyTree) -> Array:
-        if tree is None:
-            return jax.grad(sum_of_losses)(params, *columns)
-        return flat.flatten(jax.grad(sum_of_losses)(tree, *columns))
-
-    total = sum_over_batch(gradient, columns, hparams.batch_size)
+    total = sum_over_batch(
+        lambda columns: jax.grad(sum_of_losses)(params, *columns), columns, hparams.batch_size
+    )
     mean = total / num_columns(columns[0])
     return flat.adam_step(params, opt_state, mean, hparams.learning_rate)
 
 
 def soft_update(
-    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Number
+    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Array | float
 ) -> Float[Array, "*params"]:
     """The parameters of a target network that follows the online one with weight `tau`."""
     return tau * online + (1 - tau) * target

@@ -15,7 +15,7 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
 import dataclasses
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -25,9 +25,9 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Number, TorsoOptions, traced
-from sejax.agents.buffers import Rollout, Transition, rollout_buffer
-from sejax.agents.policies import Distribution, gaussian, softmax
+from sejax.agents.base import Agent, AgentSpec, Hparams, Learner, TorsoOptions
+from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
+from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.keys import murmur
@@ -43,10 +43,10 @@ from sejax.options import (
     option,
     positive,
     require,
-    shortened,
 )
 
 Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
+Moved = tuple[Array, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 ADVANTAGES = ("monte_carlo", "gae")
@@ -122,11 +122,11 @@ class PPOConfig(TorsoOptions):
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        if task.num_actions is None:
-            policy = gaussian(task.action_dim, task.max_action)
-        else:
-            policy = softmax(task.num_actions)
-        return make_ppo(self, task.obs_dim, policy, task.max_steps, task.image)
+        length = self.rollout_length(task.max_steps)
+        if task.num_actions is not None:
+            return PPO(self, task.obs_dim, task.num_actions, length, task.image).agent()
+        sizes = task.obs_dim, task.action_dim, length
+        return ContinuousPPO(self, *sizes, task.image, task.max_action).agent()
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -140,21 +140,6 @@ class PPOConfig(TorsoOptions):
         if self.rollout_steps is not None:
             return self.rollout_steps
         return self.update_episodes * task_max_steps // self.action_repeat + 1
-
-    def checked_rollout_length(self, task_max_steps: int) -> int:
-        """As `rollout_length`.
-
-        Raises:
-          ConfigError: if a rollout has fewer than two steps for each minibatch.
-        """
-        length = self.rollout_length(task_max_steps)
-        require(
-            self.num_minibatches == 1 or 2 * self.num_minibatches <= length,
-            "agent.num_minibatches",
-            f"must be at most half of the rollout's {length} steps; got "
-            f"{shortened(self.num_minibatches)}. Set agent.num_minibatches={max(1, length // 2)}.",
-        )
-        return length
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         """As of any agent; PPO learns once a rollout is full, whose length is by the task."""
@@ -172,168 +157,13 @@ class PPOConfig(TorsoOptions):
         return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), adam)
 
 
-class PPOHparams(NamedTuple):
-    """Traced hyperparameters; of `hidden_size` what is in use, None for all."""
-
-    learning_rate: Number
-    discount: Number
-    gae_lambda: Number
-    clip_ratio: Number
-    value_weight: Number
-    entropy_weight: Number
-    hidden_size: Array | None = None
-
-
 class PPOState(struct.PyTreeNode):
     """One agent. `params` are the actor's, the critic's and the std, as one flat vector."""
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
     return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
-    hparams: PPOHparams
-
-
-def make_ppo(
-    config: PPOConfig,
-    obs_dim: int,
-    policy: Distribution,
-    max_steps: int,
-    image: tuple[int, ...] = (),
-) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and a policy's actions.
-
-    `update` learns once the rollout is full and costs next to nothing before, under `vmap` too.
-
-    Args:
-      config: hyperparameters.
-      obs_dim: length of an observation.
-      policy: the distribution of actions. The rollout keeps continuous ones as drawn; they reach
-        the environment clipped to its range.
-      max_steps: the task's step limit for an episode, in environment steps.
-      image: rows, columns and channels of observations that are images, for a torso.
-
-    Raises:
-      ConfigError: if a rollout has fewer than two steps for each minibatch.
-
-    Example:
-      >>> agent = make_ppo(PPOConfig(), obs_dim=4, policy=softmax(2), max_steps=200)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
-      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
-      True
-    """
-    networks = make_networks(config, obs_dim, policy, image)
-    length = config.checked_rollout_length(max_steps)
-    optimizer = config.optimizer()
-    learn = make_learning_phase(config, networks, optimizer, obs_dim, policy.std_dim == 0)
-
-    def init(key: Array, hparams: PPOHparams) -> PPOState:
-        params = networks.init(key, hparams.hidden_size)
-        return PPOState(
-            params=params,
-            opt_state=optimizer.init(params),
-            return_sums=jnp.zeros(3),
-            hparams=jax.tree.map(jnp.float32, hparams),
-        )
-
-    def act(key: Array, state: PPOState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        outputs, std = networks.actor(networks.unflatten(state.params), obs)
-        return policy.sample(key, outputs, std) if explore else policy.mode(outputs)
-
-    return Agent(
-        init=init,
-        act=act,
-        update=_when_full(learn),
-        buffer=rollout_buffer(length),
-        hparams=traced(config, PPOHparams),
-        spec=config.spec(),
-        env_action=policy.env_action,
-        discount=lambda hparams: hparams.discount,
-    )
-
-
-def _when_full(
-    learn: Callable[[Array, PPOState, Rollout], PPOState],
-) -> Callable[[Array, PPOState, Rollout], PPOState]:
-    """Builds an update that is a learning phase where the rollout is full, and else nothing."""
-
-    def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        def phase(state: PPOState) -> PPOState:
-            # XLA would move what does not depend on the carry out of the loop, into every step.
-            inputs = (key, state.params, rollout.rows)
-            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
-            return learn(phase_key, state.replace(params=params), rollout._replace(rows=rows))
-
-        return rollout.learn_if_full(phase, state)
-
-    return update
-
-
-class Networks(NamedTuple):
-    """The actor, the critic and the std as functions of one tree of parameters.
-
-    Attributes:
-      init: `(key, hidden_size) -> params`, flat; `hidden_size` is the number of units in use, or
-        None for all.
-      unflatten: of flat parameters to the tree.
-      actor: `(tree, obs) -> (outputs, std)`.
-      critic: `(tree, obs) -> value`, `[steps]`.
-      evaluate: `(tree, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
-      least_params: lower bounds of flat parameters: only the std has one.
-    """
-
-    init: Callable[[Array, Array | None], Array]
-    unflatten: Callable[[Array], PyTree]
-    actor: Callable[[PyTree, Array], tuple[Array, Array]]
-    critic: Callable[[PyTree, Array], Array]
-    evaluate: Callable[[PyTree, Array, Array], tuple[Array, Array, Array]]
-    least_params: Float[Array, " num_params"]
-
-
-def make_networks(
-    config: PPOConfig, obs_dim: int, policy: Distribution, image: tuple[int, ...] = ()
-) -> Networks:
-    """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std.
-
-    `image` is that of `make_ppo`.
-    """
-    shape = (config.hidden_size, config.num_layers, config.activation)
-    mlps = {
-        name: config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)
-        for name, size in (("actor", policy.num_outputs), ("critic", 1))
-    }
-
-    def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
-        keys = dict(zip(mlps, jax.random.split(key), strict=True))
-        weights = {
-            name: init_narrowed(mlp, keys[name], obs_dim, hidden_size) for name, mlp in mlps.items()
-        }
-        return {**weights, "std": jnp.full(policy.std_dim, config.init_action_std, jnp.float32)}
-
-    def init(key: Array, hidden_size: Array | None) -> Array:
-        return flat.flatten(init_tree(key, hidden_size))
-
-    def actor(tree: PyTree, obs: Array) -> tuple[Array, Array]:
-        outputs: Any = mlps["actor"].apply(tree["actor"], obs)
-        return outputs, tree["std"]
-
-    def critic(tree: PyTree, obs: Array) -> Array:
-        value: Any = mlps["critic"].apply(tree["critic"], obs)
-        return value[0]
-
-    def evaluate(tree: PyTree, obs: Array, action: Array) -> tuple[Array, Array, Array]:
-        log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
-        return log_prob, entropy, critic(tree, obs)
-
-    template = jax.eval_shape(init_tree, jax.random.key(0))
-    unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
-    return Networks(
-        init=init,
-        unflatten=flat.unflattener(init_tree),
-        actor=actor,
-        critic=critic,
-        evaluate=evaluate,
-        least_params=flat.flatten({**unbounded, "std": jnp.full(policy.std_dim, MIN_STD)}),
-    )
+    hparams: Hparams
 
 
 class Batch(NamedTuple):
@@ -352,68 +182,166 @@ class Batch(NamedTuple):
     returns: Steps
 
 
-def prepared(
-    config: PPOConfig, networks: Networks, state: PPOState, steps: Transition, ended: Steps
-) -> tuple[Batch, Float[Array, "3"]]:
-    """A rollout by the parameters that made it, and the agent's sums over all returns so far.
+class PPO(Learner):
+    """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    With `advantages="monte_carlo"` returns are normalised, and the advantage is that over the value
-    which the critic has in each Adam step (`docs/reference.md` 4.5). With `"gae"` the advantages
-    are generalised ones, of rewards that `normalize_rewards` divides by the std of returns.
-    """
-    hp, tree, sums = state.hparams, networks.unflatten(state.params), state.return_sums
-    old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
-    if config.advantages == "monte_carlo":
-        returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
-        return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
-    decay, reward = hp.discount * steps.discount, steps.reward
-    if config.normalize_rewards:
-        sums = sums + power_sums(discounted_sums(reward, decay, ended))
-        reward = reward / std_of(sums)
-    next_value = networks.critic(tree, steps.next_obs)
-    advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
-    return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
+    `update` learns once the rollout is full and costs next to nothing before, under `vmap` too. A
+    tree of parameters has the keys actor, whose outputs are logits, critic and std.
 
+    Args:
+      config: hyperparameters.
+      obs_dim: length of an observation.
+      action_dim: number of actions, or the length of a continuous one: outputs of the actor.
+      length: decisions between two learning phases.
+      image: rows, columns and channels of observations that are images, for a torso.
+      max_action: the largest continuous action; None for discrete ones.
 
-def make_learning_phase(
-    config: PPOConfig,
-    networks: Networks,
-    optimizer: optax.GradientTransformation,
-    obs_dim: int,
-    is_discrete: bool,
-) -> Callable[[Array, PPOState, Rollout], PPOState]:
-    """Builds `learn(key, state, rollout) -> state`, a learning phase.
+    Raises:
+      ConfigError: if a rollout has fewer than two steps for each minibatch.
 
-    It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
-    steps. A rollout that these do not divide leaves some steps out of each pass.
+    Example:
+      >>> agent = PPO(PPOConfig(), obs_dim=4, action_dim=2, length=128).agent()
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
+      True
     """
 
-    def loss_fn(tree: PyTree, batch: Batch, hp: PPOHparams) -> Array:
-        log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
-        if batch.advantage is None:
-            advantage = jax.lax.stop_gradient(batch.returns - value)
-        else:
-            advantage = normalized(batch.advantage)
-        return ppo_loss(log_prob, entropy, value, batch.old_log_prob, advantage, batch.returns, hp)
+    config: PPOConfig
 
-    def learn(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        hp = state.hparams
-        steps = rollout.transitions(obs_dim, is_discrete)
-        batch, return_sums = prepared(config, networks, state, steps, rollout.ended)
+    def __init__(
+        self,
+        config: PPOConfig,
+        obs_dim: int,
+        action_dim: int,
+        length: int,
+        image: tuple[int, ...] = (),
+        max_action: float | None = None,
+    ):
+        require(
+            config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
+            "agent.num_minibatches",
+            f"must be at most half of the rollout's {length} steps; got {config.num_minibatches}. "
+            f"Set agent.num_minibatches={max(1, length // 2)}.",
+        )
+        self.config, self.obs_dim, self.length = config, obs_dim, length
+        self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
+        shape = (config.hidden_size, config.num_layers, config.activation)
+        self.actor, self.critic = (
+            config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)
+            for size in (action_dim, 1)
+        )
+        self.optimizer = config.optimizer()
+        template = jax.eval_shape(self.init_tree, jax.random.key(0))
+        self.unflatten = flat.inverse_of_flatten(template)
+        unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
+        # Lower bounds of flat parameters: only the std has one.
+        self.least = flat.flatten({**unbounded, "std": jnp.full(self.std_dim, MIN_STD)})
+
+    def buffer(self) -> BufferMaker:
+        return rollout_buffer(self.length)
+
+    def init_tree(self, key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
+        key_actor, key_critic = jax.random.split(key)
+        return {
+            "actor": init_narrowed(self.actor, key_actor, self.obs_dim, hidden_size),
+            "critic": init_narrowed(self.critic, key_critic, self.obs_dim, hidden_size),
+            "std": jnp.full(self.std_dim, self.config.init_action_std, jnp.float32),
+        }
+
+    def init(self, key: Array, hparams: Hparams) -> PPOState:
+        params = flat.flatten(self.init_tree(key, hparams.hidden_size))
+        return PPOState(
+            params=params,
+            opt_state=self.optimizer.init(params),
+            return_sums=jnp.zeros(3),
+            hparams=jax.tree.map(jnp.float32, hparams),
+        )
+
+    def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
+        tree = self.unflatten(state.params)
+        outputs: Any = self.actor.apply(tree["actor"], obs)
+        return self.sample(key, outputs, tree["std"]) if explore else self.mode(outputs)
+
+    def value(self, tree: PyTree, obs: Array) -> Steps:
+        """The critic's."""
+        outputs: Any = self.critic.apply(tree["critic"], obs)
+        return outputs[0]
+
+    def evaluate(self, tree: PyTree, obs: Array, action: Array) -> tuple[Steps, Steps, Steps]:
+        """The actions' log probabilities, the entropies and the values."""
+        outputs: Any = self.actor.apply(tree["actor"], obs)
+        log_prob, entropy = self.probabilities(outputs, tree["std"], action)
+        return log_prob, entropy, self.value(tree, obs)
+
+    def update(self, key: Array, state: PPOState, batch: Rollout) -> PPOState:
+        """A learning phase where the rollout is full, and else nothing."""
+
+        def phase(state: PPOState) -> PPOState:
+            # XLA would move what does not depend on the carry out of the loop, into every step.
+            inputs = (key, state.params, batch.rows)
+            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
+            return self.learn(phase_key, state.replace(params=params), batch._replace(rows=rows))
+
+        return batch.learn_if_full(phase, state)
+
+    def prepared(
+        self, state: PPOState, steps: Transition, ended: Steps
+    ) -> tuple[Batch, Float[Array, "3"]]:
+        r"""A rollout by the parameters that made it, and the agent's sums over all returns so far.
+
+        With `advantages="monte_carlo"` returns are normalised, and the advantage is that over the
+        value which the critic has in each Adam step (`docs/reference.md` 4.5). Nothing is
+        bootstrapped: an episode counts as over where it was cut, and where the rollout is. Differs:
+        the authors restart where the stored `done` exceeds 0.5, which in an SE is not so at a time
+        limit; returns there run on into the next episode.
+
+        With `"gae"` the advantages are generalised ones, of rewards that `normalize_rewards`
+        divides by the std of returns:
+
+        .. math::
+          A_t &= \delta_t + \gamma_t \lambda A_{t+1}, \quad
+          \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
+
+        within each episode, gamma times the transition's own discount, which is 0 where the episode
+        terminated. At a time limit, and where the rollout is cut, the critic's value of the next
+        state stands for what would have come.
+
+        Source: Schulman et al. (2016), eq. 11 to 16.
+        """
+        hp, tree, sums = state.hparams, self.unflatten(state.params), state.return_sums
+        old_log_prob, _, value = self.evaluate(tree, steps.obs, steps.action)
+        if self.config.advantages == "monte_carlo":
+            decay = jnp.broadcast_to(hp.discount, ended.shape)
+            returns = normalized(discounted_sums(steps.reward, decay, ended))
+            return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
+        decay, reward = hp.discount * steps.discount, steps.reward
+        if self.config.normalize_rewards:
+            sums = sums + power_sums(discounted_sums(reward, decay, ended))
+            reward = reward / std_of(sums)
+        delta = reward + decay * self.value(tree, steps.next_obs) - value
+        advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
+        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
+
+    def learn(self, key: Array, state: PPOState, rollout: Rollout) -> PPOState:
+        """A learning phase.
+
+        It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
+        steps. A rollout that these do not divide leaves some steps out of each pass.
+        """
+        config, hp = self.config, state.hparams
+        steps = rollout.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
+        batch, return_sums = self.prepared(state, steps, rollout.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
 
-        def adam_step(
-            number: Array, carry: tuple[Array, optax.OptState]
-        ) -> tuple[Array, optax.OptState]:
+        def adam_step(number: Array, carry: Moved) -> Moved:
             params, opt_state = carry
             minibatch = batch
             if config.num_minibatches > 1:
                 minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
-            gradient = jax.grad(loss_fn)(networks.unflatten(params), minibatch, hp)
+            gradient = jax.grad(self.loss)(self.unflatten(params), minibatch, hp)
             direction: Any
-            direction, opt_state = optimizer.update(flat.flatten(gradient), opt_state)
-            moved = params - hp.learning_rate * direction
-            return jnp.maximum(moved, networks.least_params), opt_state
+            direction, opt_state = self.optimizer.update(flat.flatten(gradient), opt_state)
+            return jnp.maximum(params - hp.learning_rate * direction, self.least), opt_state
 
         num_updates = config.epochs * config.num_minibatches
         params, opt_state = jax.lax.fori_loop(
@@ -421,7 +349,73 @@ def make_learning_phase(
         )
         return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
-    return learn
+    def loss(self, tree: PyTree, batch: Batch, hp: Hparams) -> Float[Array, ""]:
+        r"""What a learning phase minimises.
+
+        .. math:: -\overline{\min(\rho A, \mathrm{clip}(\rho, 1-\epsilon, 1+\epsilon) A)}
+           + c_V \overline{(V - R)^2} - c_H \overline{H}
+
+        with the ratio :math:`\rho` of the new to the old probability, the clip_ratio
+        :math:`\epsilon`, and the weights :math:`c_V` and :math:`c_H` of the value and the entropy.
+
+        Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
+        """
+        log_prob, entropy, value = self.evaluate(tree, batch.obs, batch.action)
+        if batch.advantage is None:
+            advantage = jax.lax.stop_gradient(batch.returns - value)
+        else:
+            advantage = normalized(batch.advantage)
+        ratio = bounded_exp(log_prob - batch.old_log_prob)
+        clipped = jnp.clip(ratio, 1 - hp.clip_ratio, 1 + hp.clip_ratio)
+        surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
+        value_error = jnp.mean((value - batch.returns) ** 2)
+        return -surrogate + hp.value_weight * value_error - hp.entropy_weight * jnp.mean(entropy)
+
+    # What continuous actions differ in.
+
+    def sample(self, key: Array, outputs: Array, std: Array) -> Array:
+        """An action, for one observation."""
+        return jax.random.categorical(key, outputs).astype(jnp.int32)
+
+    def mode(self, outputs: Array) -> Array:
+        """The likeliest action, for one observation."""
+        return jnp.argmax(outputs).astype(jnp.int32)
+
+    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[Steps, Steps]:
+        """The logarithms of the actions' probabilities, and the entropies, in nats."""
+        log_probs = jax.nn.log_softmax(outputs, axis=0)
+        entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
+        return select_action(log_probs, action), entropy
+
+
+class ContinuousPPO(PPO):
+    """The agent for independent normal actions with mean `max_action * tanh(outputs)`.
+
+    Their std is learned. The rollout keeps actions as drawn; they reach the environment clipped to
+    its range.
+
+    Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
+    whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
+
+    Source: `docs/reference.md` 4.5.
+    """
+
+    max_action: float
+
+    def sample(self, key: Array, outputs: Array, std: Array) -> Array:
+        return self.mode(outputs) + std * jax.random.normal(key, outputs.shape)
+
+    def mode(self, outputs: Array) -> Array:
+        return self.max_action * jnp.tanh(outputs)
+
+    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[Steps, Steps]:
+        standardized = (action - self.mode(outputs)) / std[:, None]
+        log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
+        log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
+        return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
+
+    def env_action(self, action: Array) -> Array:
+        return jnp.clip(action, -self.max_action, self.max_action)
 
 
 def shuffled(
@@ -442,35 +436,6 @@ def shuffled(
     return order[:, : num_minibatches * size].reshape(-1, size).astype(jnp.int32)
 
 
-def generalized_advantages(
-    reward: Steps,
-    decay: Steps,
-    ended: Steps,
-    value: Steps,
-    next_value: Steps,
-    gae_lambda: Array | float,
-) -> Steps:
-    r"""Advantages :math:`A_t = \delta_t + \gamma_t \lambda A_{t+1}` within each episode.
-
-    .. math:: \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
-
-    At a time limit, and where the rollout is cut, the critic's value of the next state stands for
-    what would have come.
-
-    Args:
-      reward: in units of the critic's values.
-      decay: gamma times the transition's own discount, which is 0 where the episode terminated.
-      ended: 1 at the last step of an episode, terminated or truncated, else 0.
-      value: V(s).
-      next_value: V(s').
-      gae_lambda: lambda; 0 has the least variance, 1 the least bias.
-
-    Source: Schulman et al. (2016), eq. 11 to 16.
-    """
-    delta = reward + decay * next_value - value
-    return discounted_sums(delta, gae_lambda * decay, ended)
-
-
 def power_sums(x: Steps) -> Float[Array, "3"]:
     """How many numbers there are, their sum, and that of their squares."""
     return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
@@ -480,23 +445,6 @@ def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
     """Standard deviation, and at least 1e-4, which leaves rewards finite that are always 0."""
     count, total, squares = power_sums
     return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
-
-
-def discounted_returns(reward: Steps, ended: Steps, discount: Array | float) -> Steps:
-    r"""Monte-Carlo returns :math:`R_t = r_t + \gamma R_{t+1}` within each episode.
-
-    Nothing is bootstrapped: an episode counts as over where it was cut, and where the rollout is.
-
-    Args:
-      reward: in the task's units.
-      ended: 1 at the last step of an episode, else 0.
-      discount: gamma.
-
-    Source: `docs/reference.md` 4.5. Differs: the authors restart where the stored `done` exceeds
-    0.5, which in an SE is not so at a time limit; returns there run on into the next episode.
-    """
-
-    return discounted_sums(reward, jnp.broadcast_to(discount, reward.shape), ended)
 
 
 def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
@@ -516,35 +464,6 @@ def normalized(x: Steps) -> Steps:
     return (x - jnp.mean(x)) / (std + 1e-5)
 
 
-def ppo_loss(
-    log_prob: Steps,
-    entropy: Steps,
-    value: Steps,
-    old_log_prob: Steps,
-    advantage: Steps,
-    returns: Steps,
-    hp: PPOHparams,
-) -> Float[Array, ""]:
-    r"""What a learning phase minimises.
-
-    .. math:: -\overline{\min(\rho A, \mathrm{clip}(\rho, 1-\epsilon, 1+\epsilon) A)}
-       + c_V \overline{(V - R)^2} - c_H \overline{H}
-
-    with the ratio :math:`\rho` of the new to the old probability.
-
-    Args:
-      log_prob: of the actions, in nats.
-      entropy: of the policy, in nats.
-      value: V of the critic, in units of `returns`.
-      old_log_prob: of the actions when the rollout was made.
-      advantage: A of the actions, about 1 in size; passes no gradient.
-      returns: R, what the critic is to predict.
-      hp: clip_ratio (epsilon), value_weight (c_V) and entropy_weight (c_H).
-
-    Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
-    """
-    ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
-    clipped = jnp.clip(ratio, 1 - hp.clip_ratio, 1 + hp.clip_ratio)
-    surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
-    value_error = jnp.mean((value - returns) ** 2)
-    return -surrogate + hp.value_weight * value_error - hp.entropy_weight * jnp.mean(entropy)
+def bounded_exp(log_ratio: Steps) -> Steps:
+    """Its exponential, which is finite however far the policy has moved."""
+    return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))

@@ -7,15 +7,15 @@ Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, Number, traced
-from sejax.agents.buffers import Transition, no_buffer
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
+from sejax.agents.buffers import BufferMaker, Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
 from sejax.envs.base import Task
 from sejax.options import MOVES, fraction, option, positive
@@ -49,7 +49,7 @@ class QLearningConfig(AgentOptions):
     def make(self, task: Task) -> Agent:
         """The agent for a task's numbers of states and actions."""
         assert task.num_states is not None and task.num_actions is not None
-        return make_tabular(self, task.num_states, task.num_actions)
+        return Tabular(self, task.num_states, task.num_actions).agent()
 
     def next_value(
         self, key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
@@ -77,71 +77,58 @@ class SARSAConfig(QLearningConfig):
         return jnp.sum(jnp.where(jnp.arange(q_row.size) == action, q_row, 0.0))
 
 
-class TabularHparams(NamedTuple):
-    """Traced hyperparameters."""
-
-    learning_rate: Number
-    discount: Number
-    epsilon_init: Number
-    epsilon_min: Number
-    epsilon_decay: Number
-
-
 class TabularState(struct.PyTreeNode):
     """One agent."""
 
     q_values: Float[Array, "num_states num_actions"]
     epsilon: Array
-    hparams: TabularHparams
+    hparams: Hparams
 
 
-def make_tabular(config: QLearningConfig, num_states: int, num_actions: int) -> Agent:
-    """Builds the agent for observations `0..num_states-1` and actions `0..num_actions-1`.
+class Tabular(Learner):
+    """The agent for observations `0..num_states-1` and actions `0..num_actions-1`.
 
     Example:
-      >>> agent = make_tabular(SARSAConfig(), num_states=48, num_actions=4)
+      >>> agent = Tabular(SARSAConfig(), num_states=48, num_actions=4).agent()
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
       0
     """
 
-    def init(key: Array, hparams: TabularHparams) -> TabularState:
+    config: QLearningConfig
+
+    def __init__(self, config: QLearningConfig, num_states: int, num_actions: int):
+        self.config, self.shape = config, (num_states, num_actions)
+
+    def buffer(self) -> BufferMaker:
+        return no_buffer()
+
+    def init(self, key: Array, hparams: Hparams) -> TabularState:
         hparams = jax.tree.map(jnp.float32, hparams)
         return TabularState(
-            q_values=jnp.zeros((num_states, num_actions), jnp.float32),
+            q_values=jnp.zeros(self.shape, jnp.float32),
             epsilon=jnp.float32(hparams.epsilon_init),
             hparams=hparams,
         )
 
-    def begin_episode(state: TabularState, episode: Array) -> TabularState:
+    def begin_episode(self, state: TabularState, episode: Array) -> TabularState:
         hp = state.hparams
         epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
         return state.replace(epsilon=epsilon)
 
-    def act(key: Array, state: TabularState, obs: Int[Array, ""], explore: bool) -> Array:
+    def act(self, key: Array, state: TabularState, obs: Int[Array, ""], explore: bool) -> Array:
         q_row = row_of(state.q_values, obs)
         if not explore:
             return jnp.argmax(q_row).astype(jnp.int32)
         return epsilon_greedy(key, q_row, state.epsilon)
 
-    def update(key: Array, state: TabularState, transition: Transition) -> TabularState:
-        hp, step = state.hparams, transition
-        value = config.next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
+    def update(self, key: Array, state: TabularState, batch: Transition) -> TabularState:
+        hp, step = state.hparams, batch
+        value = self.config.next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
         target = step.reward + hp.discount * step.discount * value
-        is_visited = mask_of(step.obs, step.action, (num_states, num_actions))
+        is_visited = mask_of(step.obs, step.action, self.shape)
         moved = state.q_values + hp.learning_rate * (target - state.q_values)
         return state.replace(q_values=jnp.where(is_visited, moved, state.q_values))
-
-    return Agent(
-        init=init,
-        begin_episode=begin_episode,
-        act=act,
-        update=update,
-        buffer=no_buffer(),
-        hparams=traced(config, TabularHparams),
-        spec=config.spec(),
-        discount=lambda hparams: hparams.discount,
-    )
 
 
 # Tables are read by index and written by mask. Under `vmap` on a CPU, reading by a mask over the

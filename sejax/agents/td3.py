@@ -1,13 +1,12 @@
 """TD3, and TD3 for discrete actions, whose policy is a Gumbel-Softmax.
 
-The two share everything but a `Policy`: what becomes of the actor's outputs.
+The two share everything but what becomes of the actor's outputs.
 
 Source: Fujimoto et al., "Addressing Function Approximation Error in Actor-Critic Methods" (2018);
 Jang et al., "Categorical Reparameterization with Gumbel-Softmax" (2017); the paper's
 hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -17,10 +16,15 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.base import Agent, Number, traced
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.networks import flat_network
-from sejax.agents.off_policy import ActorCriticOptions, adam_step, off_policy_agent, soft_update
+from sejax.agents.off_policy import (
+    ActorCritic,
+    ActorCriticOptions,
+    FlatNetwork,
+    adam_step,
+    soft_update,
+)
 from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.networks import MLP
@@ -52,7 +56,7 @@ class TD3Config(ActorCriticOptions):
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        return make_td3(self, task.obs_dim, tanh_policy(task.action_dim, task.max_action))
+        return TD3(self, task.obs_dim, task.action_dim, task.max_action).agent()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,28 +89,10 @@ class DiscreteTD3Config(TD3Config):
 
     def make(self, task: Task) -> Agent:
         assert task.num_actions is not None
-        policy = gumbel_softmax_policy(
-            task.num_actions, self.temperature_steps, self.one_hot_actions
-        )
-        return make_td3(self, task.obs_dim, policy)
+        return DiscreteTD3(self, task.obs_dim, task.num_actions, 1.0).agent()
 
     def mlp(self, num_outputs: int) -> MLP:
         return super().mlp(num_outputs).clone(layer_norm=self.layer_norm, may_narrow=True)
-
-
-class TD3Hparams(NamedTuple):
-    """Traced hyperparameters; of sizes what is in use, None for all."""
-
-    learning_rate: Number
-    tau: Number
-    discount: Number
-    action_noise_std: Number
-    target_noise_std: Number
-    target_noise_clip: Number
-    temperature: Number | None = None  # of discrete actions, as the next
-    final_temperature: Number | None = None
-    hidden_size: Array | None = None
-    batch_size: Array | None = None
 
 
 class TD3State(struct.PyTreeNode):
@@ -120,7 +106,7 @@ class TD3State(struct.PyTreeNode):
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
     is_warming_up: Bool[Array, ""]
-    hparams: TD3Hparams
+    hparams: Hparams
 
 
 class LearningNoise(NamedTuple):
@@ -137,45 +123,31 @@ class LearningNoise(NamedTuple):
     policy: Array | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Policy:
-    """What the two variants differ in. Actions and outputs are `[action_dim, *batch]`.
+class TD3(ActorCritic):
+    """The agent for observations `[obs_dim]` and continuous actions `max_action * tanh(outputs)`.
 
-    Attributes:
-      action_dim: length of an action.
-      max_action: the unit of all Gaussian noise.
-      draw: `(key, shape) -> noise`, the randomness of `action`.
-      action: `(outputs, noise, state) -> action` for an actor's outputs.
-      restrict: `action -> action` as it is allowed to be once Gaussian noise was added.
-      warm_up: `key -> action`, `[action_dim]`, uniformly random.
-      best: `outputs -> action` without any randomness.
-      env_action: `action -> action` as the environment takes it.
-    """
-
-    action_dim: int
-    max_action: float
-    draw: Callable[[Array, tuple[int, ...]], Array | None]
-    action: Callable[[Array, Array | None, TD3State], Array]
-    restrict: Callable[[Array], Array]
-    warm_up: Callable[[Array], Array]
-    best: Callable[[Array], Array]
-    env_action: Callable[[Array], Array]
-
-
-def make_td3(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and a policy's actions.
+    Noise does not lead out of their range. Actions, and outputs of the actor, are
+    `[action_dim, *batch]`; `max_action` is the unit of all Gaussian noise.
 
     Example:
-      >>> agent = make_td3(TD3Config(), obs_dim=3, policy=tanh_policy(1, max_action=2.0))
+      >>> agent = TD3(TD3Config(), obs_dim=3, action_dim=1, max_action=2.0).agent()
       >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
       (1,)
     """
-    networks = make_networks(config, obs_dim, policy.action_dim)
-    learn = make_learning_step(config, networks, policy)
 
-    def init(key: Array, hparams: TD3Hparams) -> TD3State:
-        actor, critics = networks.init(key, hparams.hidden_size)
+    config: TD3Config
+
+    def __init__(self, config: TD3Config, obs_dim: int, action_dim: int, max_action: float):
+        self.config, self.action_dim, self.max_action = config, action_dim, max_action
+        self.actor = FlatNetwork(config.mlp(action_dim), obs_dim)
+        self.critic = FlatNetwork(config.mlp(1), obs_dim + action_dim)
+
+    def init(self, key: Array, hparams: Hparams) -> TD3State:
+        key_actor, key_critics = jax.random.split(key)
+        init_critics = jax.vmap(self.critic.init, (0, None))
+        critics = init_critics(jax.random.split(key_critics), hparams.hidden_size)
+        actor = self.actor.init(key_actor, hparams.hidden_size)
         return TD3State(
             actor=actor,
             critics=critics,
@@ -184,98 +156,58 @@ def make_td3(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
             actor_opt_state=flat.ADAM.init(actor),
             critic_opt_state=flat.ADAM.init(critics),
             num_updates=jnp.int32(0),
-            is_warming_up=jnp.bool_(config.warmup_episodes > 0),
+            is_warming_up=jnp.bool_(self.config.warmup_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
-    def act(key: Array, state: TD3State, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        outputs = networks.actor(state.actor, obs)
-        if not explore and not config.noisy_tests:
-            return policy.best(outputs)
+    def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
+        outputs = self.actor.apply(state.actor, obs)
+        if not explore and not self.config.noisy_tests:
+            return self.best(outputs)
         key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
-        action = policy.action(outputs, policy.draw(key_policy, outputs.shape), state)
-        noise = policy.max_action * jax.random.normal(key_noise, outputs.shape)
-        action = policy.restrict(action + state.hparams.action_noise_std * noise)
+        action = self.action(outputs, self.draw(key_policy, outputs.shape), state)
+        noise = self.max_action * jax.random.normal(key_noise, outputs.shape)
+        action = self.restrict(action + state.hparams.action_noise_std * noise)
         if not explore:
             return action
-        return jnp.where(state.is_warming_up, policy.warm_up(key_warm_up), action)
+        return jnp.where(state.is_warming_up, self.warm_up(key_warm_up), action)
 
-    def update(key: Array, state: TD3State, batch: Transition) -> TD3State:
-        return learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
+    def update(self, key: Array, state: TD3State, batch: Transition) -> TD3State:
+        return self.learn(state, batch, self.draw_noise(key, batch.action.shape))
 
-    return off_policy_agent(
-        config,
-        hparams=traced(config, TD3Hparams),
-        init=init,
-        begin_episode=config.begin_episode,
-        act=act,
-        update=update,
-        env_action=policy.env_action,
-    )
+    def draw_noise(self, key: Array, shape: tuple[int, ...]) -> LearningNoise:
+        """The random numbers of a learning step on actions `[action_dim, batch]`."""
+        key_smoothing, key_target, key_policy = jax.random.split(key, 3)
+        return LearningNoise(
+            smoothing=jax.random.normal(key_smoothing, shape),
+            target_policy=self.draw(key_target, shape),
+            policy=self.draw(key_policy, shape),
+        )
 
+    def learn(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+        """A step of the critics; of the actor and all targets in every `policy_delay`-th.
 
-# --- networks ------------------------------------------------------------------------------------
+        Source: Fujimoto et al. (2018), algorithm 1; `docs/reference.md` 4.3.
+        """
+        state = state.replace(num_updates=state.num_updates + 1)
+        state = self.update_critics(state, batch, noise)
+        if self.config.policy_delay == 1:
+            return self.update_actor(state, batch, noise)
+        return jax.lax.cond(
+            state.num_updates % self.config.policy_delay == 0,
+            lambda state: self.update_actor(state, batch, noise),
+            lambda state: state,
+            state,
+        )
 
-
-class Networks(NamedTuple):
-    """The actor and the critics as functions of flat parameters.
-
-    Attributes:
-      init: `(key, hidden_size) -> (actor, critics)`, parameters `[n]` and `[2, m]`. `hidden_size`
-        is the number of units in use, or None for all.
-      actor: `(actor, obs) -> outputs`, `[action_dim, *batch]`, before the policy.
-      critic: `(critic, obs, action) -> q_values`, `[*batch]`, of one of the critics.
-    """
-
-    init: Callable[[Array, Array | None], tuple[Array, Array]]
-    actor: Callable[[Array, Array], Array]
-    critic: Callable[[Array, Array, Array], Array]
-
-
-def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
-    """An actor `s -> [action_dim]` and critics `[s, a] -> Q` of the same hidden layers."""
-    actor = flat_network(config.mlp(action_dim), obs_dim)
-    critic = flat_network(config.mlp(1), obs_dim + action_dim)
-
-    def init(key: Array, hidden_size: Array | None = None) -> tuple[Array, Array]:
-        key_actor, key_critics = jax.random.split(key)
-        init_critics = jax.vmap(critic.init, (0, None))
-        critics = init_critics(jax.random.split(key_critics), hidden_size)
-        return actor.init(key_actor, hidden_size), critics
-
-    return Networks(
-        init=init,
-        actor=actor.apply,
-        critic=lambda params, obs, action: critic.apply(params, jnp.concatenate([obs, action]))[0],
-    )
-
-
-# --- learning ------------------------------------------------------------------------------------
-
-
-def make_learning_step(
-    config: TD3Config, networks: Networks, policy: Policy
-) -> Callable[[TD3State, Transition, LearningNoise], TD3State]:
-    """Builds `learn(state, batch, noise) -> state`, one step of both variants.
-
-    The critics move in every step, the actor and all targets in every `config.policy_delay`-th.
-
-    Source: Fujimoto et al. (2018), algorithm 1; `docs/reference.md` 4.3.
-    """
-
-    def both_q(critics: Array, obs: Array, action: Array) -> Float[Array, "2 batch"]:
-        return jax.vmap(networks.critic, (0, None, None))(critics, obs, action)
-
-    def update_critics(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        hp = state.hparams
+    def update_critics(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+        hp, q_values = state.hparams, jax.vmap(self.q_value, (0, None, None))
 
         def sum_of_losses(critics: Array, batch: Transition, noise: LearningNoise) -> Array:
-            next_action = smoothed_target_action(
-                networks.actor(state.target_actor, batch.next_obs), noise, state, policy
-            )
-            next_q = jnp.min(both_q(state.target_critics, batch.next_obs, next_action), axis=0)
+            next_action = self.smoothed_target_action(state, batch.next_obs, noise)
+            next_q = jnp.min(q_values(state.target_critics, batch.next_obs, next_action), axis=0)
             targets = batch.reward + hp.discount * batch.discount * next_q
-            errors = both_q(critics, batch.obs, batch.action) - targets[None]
+            errors = q_values(critics, batch.obs, batch.action) - targets[None]
             return jnp.sum(batch.weight * jnp.sum(errors**2, axis=0))
 
         critics, opt_state = adam_step(
@@ -283,12 +215,13 @@ def make_learning_step(
         )
         return state.replace(critics=critics, critic_opt_state=opt_state)
 
-    def update_actor(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+    def update_actor(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
         hp = state.hparams
 
         def sum_of_losses(actor: Array, batch: Transition, noise: LearningNoise) -> Array:
-            action = policy.action(networks.actor(actor, batch.obs), noise.policy, state)
-            return -jnp.sum(batch.weight * networks.critic(state.critics[0], batch.obs, action))
+            outputs = self.actor.apply(actor, batch.obs)
+            action = self.action(outputs, noise.policy, state)
+            return -jnp.sum(batch.weight * self.q_value(state.critics[0], batch.obs, action))
 
         actor, opt_state = adam_step(
             sum_of_losses, state.actor, state.actor_opt_state, (batch, noise), hp
@@ -300,96 +233,71 @@ def make_learning_step(
             target_critics=soft_update(state.target_critics, state.critics, hp.tau),
         )
 
-    def learn(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        state = state.replace(num_updates=state.num_updates + 1)
-        state = update_critics(state, batch, noise)
-        if config.policy_delay == 1:
-            return update_actor(state, batch, noise)
-        return jax.lax.cond(
-            state.num_updates % config.policy_delay == 0,
-            lambda state: update_actor(state, batch, noise),
-            lambda state: state,
-            state,
-        )
+    def q_value(self, critic: Array, obs: Array, action: Array) -> Float[Array, "*batch"]:
+        """Of one of the critics."""
+        return self.critic.apply(critic, jnp.concatenate([obs, action]))[0]
 
-    return learn
+    def smoothed_target_action(self, state: TD3State, obs: Array, noise: LearningNoise) -> Array:
+        r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, as allowed.
 
+        Source: Fujimoto et al. (2018), eq. 14.
+        """
+        hp, clip = state.hparams, state.hparams.target_noise_clip
+        smoothing = jnp.clip(hp.target_noise_std * noise.smoothing, -clip, clip)
+        outputs = self.actor.apply(state.target_actor, obs)
+        action = self.action(outputs, noise.target_policy, state)
+        return self.restrict(action + self.max_action * smoothing)
 
-def draw_learning_noise(key: Array, policy: Policy, shape: tuple[int, ...]) -> LearningNoise:
-    """The random numbers of a learning step on actions `[action_dim, batch]`."""
-    key_smoothing, key_target, key_policy = jax.random.split(key, 3)
-    return LearningNoise(
-        smoothing=jax.random.normal(key_smoothing, shape),
-        target_policy=policy.draw(key_target, shape),
-        policy=policy.draw(key_policy, shape),
-    )
+    # What discrete actions differ in.
 
+    def draw(self, key: Array, shape: tuple[int, ...]) -> Array | None:
+        """The randomness of `action`."""
+        return None
 
-def smoothed_target_action(
-    outputs: Float[Array, "actions batch"], noise: LearningNoise, state: TD3State, policy: Policy
-) -> Float[Array, "actions batch"]:
-    r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, as allowed.
+    def action(self, outputs: Array, noise: Array | None, state: TD3State) -> Array:
+        """The policy's action for an actor's outputs."""
+        return self.best(outputs)
 
-    Source: Fujimoto et al. (2018), eq. 14.
-    """
-    hp = state.hparams
-    smoothing = jnp.clip(
-        hp.target_noise_std * noise.smoothing, -hp.target_noise_clip, hp.target_noise_clip
-    )
-    action = policy.action(outputs, noise.target_policy, state)
-    return policy.restrict(action + policy.max_action * smoothing)
+    def restrict(self, action: Array) -> Array:
+        """An action as it is allowed to be once Gaussian noise was added."""
+        return jnp.clip(action, -self.max_action, self.max_action)
 
+    def warm_up(self, key: Array) -> Array:
+        """A uniformly random action, `[action_dim]`."""
+        low, high = -self.max_action, self.max_action
+        return jax.random.uniform(key, (self.action_dim,), minval=low, maxval=high)
 
-# --- policies ------------------------------------------------------------------------------------
+    def best(self, outputs: Array) -> Array:
+        """The action without any randomness."""
+        return self.max_action * jnp.tanh(outputs)
 
 
-def tanh_policy(action_dim: int, max_action: float) -> Policy:
-    """Continuous actions `max_action * tanh(outputs)`; noise does not lead out of their range."""
+class DiscreteTD3(TD3):
+    """The agent for discrete actions as relaxed one-hot vectors; noise may lead anywhere."""
 
-    def squash(outputs: Array) -> Array:
-        return max_action * jnp.tanh(outputs)
+    config: DiscreteTD3Config
 
-    return Policy(
-        action_dim=action_dim,
-        max_action=max_action,
-        draw=lambda key, shape: None,
-        action=lambda outputs, noise, state: squash(outputs),
-        restrict=lambda action: jnp.clip(action, -max_action, max_action),
-        warm_up=lambda key: jax.random.uniform(
-            key, (action_dim,), minval=-max_action, maxval=max_action
-        ),
-        best=squash,
-        env_action=lambda action: action,
-    )
+    def draw(self, key: Array, shape: tuple[int, ...]) -> Array | None:
+        return jax.random.gumbel(key, shape)
 
-
-def gumbel_softmax_policy(num_actions: int, temperature_steps: int, one_hot: bool) -> Policy:
-    """Discrete actions as relaxed one-hot vectors; noise may lead anywhere.
-
-    Args:
-      num_actions: length of the vector.
-      temperature_steps: learning steps until the final temperature.
-      one_hot: whether the vectors are exactly one-hot, with the relaxed ones' gradients.
-    """
-
-    def action(outputs: Array, noise: Array | None, state: TD3State) -> Array:
+    def action(self, outputs: Array, noise: Array | None, state: TD3State) -> Array:
         assert noise is not None
-        temperature = annealed_temperature(state.hparams, state.num_updates, temperature_steps)
-        return gumbel_softmax(outputs, noise, temperature, one_hot)
+        steps = self.config.temperature_steps
+        temperature = annealed_temperature(state.hparams, state.num_updates, steps)
+        return gumbel_softmax(outputs, noise, temperature, self.config.one_hot_actions)
 
-    def warm_up(key: Array) -> Array:
-        return jax.nn.one_hot(jax.random.randint(key, (), 0, num_actions), num_actions)
+    def restrict(self, action: Array) -> Array:
+        return action
 
-    return Policy(
-        action_dim=num_actions,
-        max_action=1.0,
-        draw=jax.random.gumbel,
-        action=action,
-        restrict=lambda action: action,
-        warm_up=warm_up,
-        best=_one_hot_of_largest,
-        env_action=lambda action: jnp.argmax(action, axis=0).astype(jnp.int32),
-    )
+    def warm_up(self, key: Array) -> Array:
+        index = jax.random.randint(key, (), 0, self.action_dim)
+        return jax.nn.one_hot(index, self.action_dim)
+
+    def best(self, outputs: Array) -> Array:
+        return _one_hot_of_largest(outputs)
+
+    def env_action(self, action: Array) -> Array:
+        return jnp.argmax(action, axis=0).astype(jnp.int32)
 
 
 def gumbel_softmax(
@@ -415,7 +323,7 @@ def gumbel_softmax(
     return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
 
 
-def annealed_temperature(hparams: TD3Hparams, num_updates: Array, num_steps: int) -> Array:
+def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
@@ -424,7 +332,6 @@ def annealed_temperature(hparams: TD3Hparams, num_updates: Array, num_steps: int
     Source: `docs/reference.md` 4.4.
     """
     progress = jnp.minimum(num_updates / num_steps, 1.0)
-    assert hparams.temperature is not None and hparams.final_temperature is not None
     factor = 1 + progress * (hparams.final_temperature - 1)
     return jnp.maximum(hparams.temperature * factor, _MIN_TEMPERATURE)
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.ops.scores import is_tie
+from sejax.ops.scores import is_tie, or_lowest
 from sejax.options import ConfigError, registry, require, told, unknown_name
 
 FIELD = "es.score_transform"
@@ -43,7 +43,7 @@ def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     :math:`R_i` counts the candidates with a lower score, so that ties share a rank.
     """
-    scores = _ranked_last(scores)
+    scores = or_lowest(scores)
     ranks = (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
     return _safe_divide(ranks, ranks.max())  # the lowest is 0
 
@@ -58,20 +58,17 @@ def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     Here :math:`R_i` is 1 for the best, as in the source; the paper's text defines it with 0 for
     the worst, for which the logarithm is not defined. Ties share the better rank.
     """
-    utilities = _log_utilities(scores) - 1 / scores.shape[0]
-    utilities = jnp.where(_any_differ(scores), utilities, 0.0)
-    return _safe_divide(utilities, jnp.abs(utilities).max())
+    return _scaled_utilities(scores, 1 / scores.shape[0])
 
 
 def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """As `nes` without the subtraction of 1/n_p: the worse half weighs nothing, the best 1."""
-    utilities = jnp.where(_any_differ(scores), _log_utilities(scores), 0.0)
-    return _safe_divide(utilities, jnp.abs(utilities).max())
+    return _scaled_utilities(scores, 0.0)
 
 
 def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """1 for the candidate of the best rank (for each, if several share it), 0 for the others."""
-    scores = _ranked_last(scores)
+    scores = or_lowest(scores)
     return jnp.where((scores == scores.max()) & jnp.isfinite(scores), 1.0, 0.0)
 
 
@@ -170,23 +167,18 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return jnp.where(is_better, jnp.maximum(scores - floor, 0.0), 0.0)
 
 
-def _log_utilities(scores: Scores) -> Scores:
-    """Utilities that sum to 1; 0 for a score that is not finite, whatever its rank."""
-    num_candidates = scores.shape[0]
-    ranked = _ranked_last(scores)
+def _scaled_utilities(scores: Scores, subtracted: float) -> Scores:
+    """Log utilities less a constant, with a largest magnitude of 1; 0 if all scores are equal.
+
+    They sum to 1 before, and are 0 for a score that is not finite, whatever its rank.
+    """
+    ranked = or_lowest(scores)
     best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)
-    utilities = jnp.maximum(0.0, jnp.log(num_candidates / 2 + 1) - jnp.log(best_is_one))
+    utilities = jnp.maximum(0.0, jnp.log(scores.shape[0] / 2 + 1) - jnp.log(best_is_one))
     utilities = jnp.where(jnp.isfinite(scores), utilities, 0.0)
-    return _safe_divide(utilities, utilities.sum())
-
-
-def _any_differ(scores: Scores) -> Array:
-    ranked = _ranked_last(scores)
-    return ranked.max() > ranked.min()
-
-
-def _ranked_last(scores: Scores) -> Scores:
-    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
+    utilities = _safe_divide(utilities, utilities.sum()) - subtracted
+    utilities = jnp.where(ranked.max() > ranked.min(), utilities, 0.0)
+    return _safe_divide(utilities, jnp.abs(utilities).max())
 
 
 def _floor_nonfinite(scores: Scores) -> Scores:

@@ -177,9 +177,14 @@ def option(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """A dataclass whose fields check themselves. `group` is where the command line has them."""
+    """A dataclass whose fields check themselves.
+
+    `group` is where the command line has them. `removed` are fields of earlier versions, with the
+    only value that a file may still give them: what is computed without them.
+    """
 
     group: ClassVar[str] = ""
+    removed: ClassVar[tuple[tuple[str, Any], ...]] = ()
 
     def __post_init__(self) -> None:
         check(self, self.group)

@@ -75,7 +75,10 @@ def from_plain(
         ) from error
     fields, read = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in fields}
+    removed = getattr(cls, "removed", ())
     for name, value in values.items():
+        if (name, value) in removed:
+            continue
         if name not in fields:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
         if marks(cls, name).get("names_code") and ":" in str(value):
