@@ -7,8 +7,6 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 
-import yaml
-
 from sejax.options import FailedError
 from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
@@ -45,25 +43,16 @@ def help_text(overrides: Sequence[str]) -> str:
     return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
-def config_text(overrides: Sequence[str]) -> str:
-    """What `--print-config` prints: the `config.yaml` of each run."""
-    plain = [configuration.plain(config) for config in configs_of(overrides)]
-    return yaml.safe_dump_all(plain, sort_keys=False)
-
-
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     """The configuration of each run that the overrides describe, with folders of their own."""
-    configs = []
-    for of_run in compose.expand(overrides):
-        config = configuration.config(of_run)
-        given = config.run_dir
-        known = LearnConfig.in_run_dir if given is None else ("run_dir",)
-        swept = compose.name_in_sweep(overrides, of_run, known)
-        if swept:  # or all runs of a sweep would have one folder
-            folder = f"{config.resolved_run_dir}_{swept}" if given is None else f"{given}/{swept}"
-            config = dataclasses.replace(config, run_dir=folder)
-        configs += runs_of(config)
-    return configs
+    configs = compose.swept(
+        overrides,
+        configuration.config,
+        "run_dir",
+        lambda config, name: f"{config.resolved_run_dir}_{name}",
+        LearnConfig.in_run_dir,
+    )
+    return [of_seed for config in configs for of_seed in runs_of(config)]
 
 
 def runs_of(config: LearnConfig) -> list[LearnConfig]:
@@ -106,8 +95,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     if program != compiled:
                         machines.close()
                         runtime.configure_jax()
-                        made = config.machines.make(config)
-                        compiled, chunks = program, machines.enter_context(made)
+                        chunks = machines.enter_context(config.machines.make(config))
+                        compiled = program
                     ended = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     progress.stop()
@@ -135,4 +124,4 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, config_text)
+    commands.start(main, help_text, configs_of)

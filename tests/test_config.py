@@ -51,7 +51,7 @@ def test_every_task_composes_with_every_preset(env, preset):
 
 @pytest.mark.parametrize("group", ["es", "objective", "exploration", "tracker"])
 def test_every_choice_of_a_group_composes(group):
-    for name in registry.GROUPS[group].built_in:
+    for name in registry.BUILT_IN[group]:
         env = ["env=cliff_walking"] if name == "count_based" else []
         if registry.GROUPS[group].entry_points != "sejax.trackers" or name in ("none",):
             assert sejax.config([*env, f"{group}={name}"]).name(group) == name
@@ -276,7 +276,7 @@ def test_a_preset_file_that_is_not_there_is_one_message(tmp_path):
         ("generations 30", "an override", "Write generations=30."),
         ("env seed=1", "an override", "Write env=VALUE."),
         ("runs/first seed=1", "an override", "proxy=runs/first"),
-        ("agents=[ddqn,ppo", "agents", "close its bracket"),
+        ("agents=[ddqn,ppo", "agents", "brackets close"),
         ("agents=[ddqn, ppo]", "agents", "Set agents=[ddqn]."),
         ("es.score_transform=my_rank", "es.score_transform", "es.score_transform=rank?"),
         ("es.score_transform=a b:c", "an override", ""),

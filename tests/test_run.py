@@ -29,7 +29,7 @@ TINY = [*OWN, "agent.learning_rate=0.5"]
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
 RUN = [sys.executable, "-m", "sejax.run"]
-START = functools.partial(commands.start, run.main, run.help_text, run.config_text)
+START = functools.partial(commands.start, run.main, run.help_text, run.configs_of)
 
 
 @functools.cache

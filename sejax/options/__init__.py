@@ -25,7 +25,6 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
-import difflib
 import inspect
 import numbers
 import os
@@ -35,7 +34,9 @@ import textwrap
 import traceback
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable
+from collections import ChainMap
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -63,16 +64,21 @@ class ConfigError(ValueError):
         super().__init__(message)
         self.field = field
 
-    def moved(self, group: str, where: str) -> "ConfigError":
-        """The same error of fields that stand elsewhere, as `agents.ddqn` for `agent`."""
-        if group in ("", where):
-            return self
-        at_fault = re.sub(rf"^{group}\b", where, self.field)
-        return ConfigError(re.sub(rf"\b{group}(?=\.\w| must )", where, str(self)), at_fault)
-
 
 class FailedError(RuntimeError):
     """Computing that cannot go on. Commands print its message and exit with status 1."""
+
+
+@contextlib.contextmanager
+def errors_of(group: str, where: str) -> Iterator[None]:
+    """Errors about a group in here name the place where it stands, as `agents.ddqn` for `agent`."""
+    try:
+        yield
+    except ConfigError as error:
+        if group in ("", where):
+            raise
+        message = re.sub(rf"\b{group}(?=\.\w| must )", where, str(error))
+        raise ConfigError(message, re.sub(rf"^{group}\b", where, error.field)) from None
 
 
 def require(holds: object, field: str, message: str) -> None:
@@ -99,13 +105,8 @@ def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
 
 def nearest(got: object, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
-    start = str(got)[:200]  # comparing takes time that grows with the square of the length
-
-    def similarity(name: str) -> float:  # where the case differs, the letters count
-        pairs = (start, name), (start.lower(), name.lower())
-        return sum(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
-
-    return sorted(known, key=similarity, reverse=True)
+    text = str(got)[:200].lower()  # comparing takes time that grows with the square of the length
+    return sorted(known, key=lambda name: -SequenceMatcher(None, text, name.lower()).ratio())
 
 
 def listed(names: Collection[str], most: int = 120) -> str:
@@ -121,12 +122,12 @@ def shortened(value: object, length: int = 80) -> str:
 
 def told(error: BaseException) -> str:
     """An error of other code on one line: its kind, its message, its place in a user's file."""
-    place, text = place_of(error), shortened(" ".join(str(error).split()), 120)
-    kinds = [cls.__name__ for cls in type(error).__mro__]
+    line, text = place_of(error), shortened(" ".join(str(error).split()), 120)
+    classes = [cls.__name__ for cls in type(error).__mro__]
     # jax's errors of a value that is not known while tracing; their texts tell of jax's inside.
-    if any(kind.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for kind in kinds):
+    if any(name.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for name in classes):
         text = "Python code needs the value of a traced array; use jnp.where, or jax.numpy"
-    return f"{kinds[0]}: {text}{f' ({place})' if place else ''}"
+    return f"{classes[0]}: {text}{f' ({line})' if line else ''}"
 
 
 def place_of(error: BaseException) -> str:
@@ -135,13 +136,13 @@ def place_of(error: BaseException) -> str:
     Python's library, installed packages and sejax are not the user's own.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith(("<", *_LIBRARIES))]
-    if not own:
+    users = [frame for frame in frames if not frame.filename.startswith(("<", *_LIBRARIES))]
+    if not users:
         return ""
-    path = Path(own[-1].filename)
+    path = Path(users[-1].filename)
     with contextlib.suppress(OSError, ValueError):  # it is elsewhere
         path = path.relative_to(Path.cwd())
-    return f"{path}:{own[-1].lineno}: {shortened(own[-1].line, 60)}"
+    return f"{path}:{users[-1].lineno}: {shortened(users[-1].line, 60)}"
 
 
 _LIBRARIES = (
@@ -195,12 +196,10 @@ def check(config: Options, group: str) -> None:
       ConfigError: for the first one that does not hold.
     """
     for field in dataclasses.fields(config):
-        given = getattr(config, field.name)
-        value = as_python(given)
+        value = as_python(getattr(config, field.name))
         if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
             value = float(value)
-        if value is not given:
-            object.__setattr__(config, field.name, value)
+        object.__setattr__(config, field.name, value)
         rule = marks(type(config), field.name).get("rule")
         may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
         if rule is not None and not (value is None and may_be_none):
@@ -221,11 +220,26 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
     So that `warmup_episodes: int = 5` in a subclass changes the default alone.
     """
-    found: dict[str, Any] = {}
-    for base in reversed(cls.__mro__):
-        field = vars(base).get("__dataclass_fields__", {}).get(name)
-        found |= dict(field.metadata) if field is not None else {}
-    return found
+    fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
+    return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
+
+
+def field_lines(
+    values: Mapping[str, Any], texts: Mapping[str, str], sources: Mapping[str, str] | None = None
+) -> str:
+    """Lines of `--help`: each field with its value, its text, and where its value comes from.
+
+    Args:
+      values: plain values by the fields' names.
+      texts: from `help_texts`, by the same names.
+      sources: what stands behind a field's text, such as the layer that its value is from.
+    """
+    lines = []
+    for name, value in values.items():
+        about = f"  # {texts[name]}" if name in texts else ""
+        line = f"  {name}={as_text(value)}{about}{(sources or {}).get(name, '')}"
+        lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
+    return "\n".join(lines)
 
 
 def help_texts(cls: type) -> dict[str, str]:
@@ -263,8 +277,9 @@ def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
     """The rule that a predicate holds; see `require`."""
 
     def apply(name: str, value: Any, default: Any) -> None:
-        got, fix = shortened(value), f"{name}={as_text(default)}"
-        require(holds(value), name, f"must {must}, because {reason}; got {got}. Set {fix}.")
+        if not holds(value):
+            got, fix = shortened(value), f"{name}={as_text(default)}"
+            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
 
     return apply
 

@@ -19,6 +19,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sejax.options import (
     ConfigError,
     as_text,
+    errors_of,
     is_number,
     listed,
     marks,
@@ -68,26 +69,21 @@ def from_plain(
     try:
         hints = typing.get_type_hints(cls)
     except NameError as error:
-        raise ConfigError(
-            f"{where} must have fields of known types; {cls.__name__} raised {told(error)}. Import "
-            "that type where the class is defined.",
-            where,
-        ) from error
-    fields, read = fields_of(cls), {}
-    full = {name: f"{where}.{name}".lstrip(".") for name in fields}
+        message = f"{where} must have fields of known types; {cls.__name__} raised {told(error)}."
+        raise ConfigError(message, where) from error
+    defaults, fields = fields_of(cls), {}
+    full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
-        if name not in fields:
+        if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
         if marks(cls, name).get("names_code") and ":" in str(value):
             require_typed(full[name], str(value), imports)
-        read[name] = _read(value, hints[name], full[name], fields[name], imports)
-    for name, default in fields.items():
-        is_open = name in read or default is not MISSING
-        require(is_open, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
-    try:
-        return cls(**read)
-    except ConfigError as error:
-        raise error.moved(getattr(cls, "group", where), where) from None
+        fields[name] = _read(value, hints[name], full[name], defaults[name], imports)
+    for name, default in defaults.items():
+        is_known = name in fields or default is not MISSING
+        require(is_known, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
+    with errors_of(getattr(cls, "group", where), where):
+        return cls(**fields)
 
 
 def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
@@ -96,12 +92,12 @@ def require_typed(field: str, path: str, imports: Collection[str] | None) -> Non
     Raises:
       ConfigError: if it is not one of `imports`.
     """
+    got = shortened(path, 60)
     require(
         imports is None or path in imports,
         field,
-        "must be typed on the command line if it is of a module of your own: what a file names is "
-        f"never imported; got {shortened(path, 60)}. Set {field}={shortened(path, 60)}, if you "
-        "trust it.",
+        "must be typed on the command line, as a module that a file names is never imported; got "
+        f"{got}. Set {field}={got}, if you trust it.",
     )
 
 
@@ -124,36 +120,33 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
 
 def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
     """A value as its field's type, which pydantic converts; an error says what it must be."""
-    candidates: tuple[Any, ...] = (value,)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
-        is_read = isinstance(value, hint | Mapping)
-        require(is_read, name, f"must {fields}; got {shortened(repr(value))}. Leave it out.")
         if isinstance(value, hint):
             return value
+        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
+        message = f"must {fields}; got {shortened(repr(value))}. Leave it out."
+        require(isinstance(value, Mapping), name, message)
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name, imports)
-    item = next(iter(typing.get_args(hint)), None)
-    if dataclasses.is_dataclass(item) and isinstance(value, list | tuple):
-        return tuple(_read(each, item, name, MISSING, imports) for each in value)
+    candidates = [value]
     if isinstance(value, str):
-        text = expanded(value)
-        candidates = parsed(text), text
+        candidates = [parsed(expanded(value)), expanded(value)]
     elif is_number(value):  # or a name of digits, as of a folder
-        candidates = value, str(value)
+        candidates = [value, str(value)]
     must = "be no true or false"
     for candidate in candidates:
+        if candidate is None and default is None:
+            return None
         try:
-            read = _adapter(hint).validate_python(candidate)
+            converted = _adapter(hint).validate_python(candidate)
         except ValidationError as error:
             must = error.errors()[0]["msg"].removeprefix("Input should ").partition(", unable")[0]
-        else:
-            if isinstance(candidate, bool) == isinstance(read, bool):  # which are numbers in Python
-                return read
+        else:  # bools are numbers in Python
+            if isinstance(candidate, bool) == isinstance(converted, bool):
+                return converted
     is_open = default is MISSING or dataclasses.is_dataclass(default)
     fix = "VALUE" if is_open else as_text(to_plain(default))
-    got = shortened(repr(value))
-    raise ConfigError(f"{name} must {must}; got {got}. Set {name}={fix}.", name)
+    raise ConfigError(f"{name} must {must}; got {shortened(repr(value))}. Set {name}={fix}.", name)
 
 
 @functools.cache
@@ -198,13 +191,13 @@ def differences(
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
       'es.noise_std (0.1 there, 0.2 here)'
     """
-    found = [
+    differing = [
         f"{name} ({shortened(old, 60)} there, {shortened(new, 60)} here)"
         for name, old, new in _differing(there, here)
         if name.partition(".")[0] not in free
     ]
-    more = f" and {len(found) - most} more" if len(found) > most else ""
-    return ", ".join(found[:most]) + more
+    more = f" and {len(differing) - most} more" if len(differing) > most else ""
+    return ", ".join(differing[:most]) + more
 
 
 def _differing(
