@@ -124,14 +124,9 @@ def _as_json(summary: pd.DataFrame) -> str:
     """An object for each world; with several agents, in it one for each of them."""
     if summary.index.nlevels == 1:
         return str(summary.to_json(orient="index", indent=2))
-    worlds = summary.groupby("world", sort=False)
-    return json.dumps(
-        {
-            world: json.loads(rows.droplevel("world").to_json(orient="index"))
-            for world, rows in worlds
-        },
-        indent=2,
-    )
+    worlds = summary.index.unique("world")
+    nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
+    return json.dumps(nested, indent=2)
 
 
 def spread(mean: float, std: float, digits: int) -> str:

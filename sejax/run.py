@@ -50,7 +50,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
         configuration.config,
         "run_dir",
         lambda config, name: f"{config.resolved_run_dir}_{name}",
-        LearnConfig.in_run_dir,
+        configuration.IN_RUN_DIR,
     )
     return [of_seed for config in configs for of_seed in runs_of(config)]
 

@@ -64,11 +64,11 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
 
 
 @pytest.mark.parametrize(("words", "meant"), [
-    (["--env", "cartpole"], "env=cartpole,"), (["--env=cartpole", "seed=1"], "env=cartpole,"),
-    (["-agent"], "agent=VALUE,"), (["--seed", "env=cartpole"], "seed=VALUE,"),
+    (["--env", "cartpole"], "env=cartpole."), (["--env=cartpole", "seed=1"], "env=cartpole."),
+    (["-agent"], "agent=VALUE."), (["--seed", "env=cartpole"], "seed=VALUE."),
 ])  # fmt: skip
 def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words, meant):
-    main = functools.partial(commands.start, print, str)
+    main = functools.partial(commands.start, sejax.config, str)
     status, _, said = ended(monkeypatch, capsys, main, *words)
     assert status == commands.BAD_INPUT and said.count("\n") == 1 and f"Write {meant}" in said
 

@@ -42,6 +42,7 @@ from typing import Any, ClassVar
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
 MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
+NOTHING = "there is nothing to learn from or with otherwise"
 MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
@@ -96,11 +97,8 @@ def require(holds: object, field: str, message: str) -> None:
 def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
-    return ConfigError(
-        f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}. "
-        f"Did you mean {field}={ranked[0]}?",
-        field,
-    )
+    message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
+    return ConfigError(f"{message} Did you mean {field}={ranked[0]}?", field)
 
 
 def nearest(got: object, known: Iterable[str]) -> list[str]:
@@ -246,7 +244,7 @@ def help_texts(cls: type) -> dict[str, str]:
     """What the docstrings of a class and its bases say of its attributes, by their names."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        _, _, rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")
+        rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
         section = re.split(r"\n\n(?=\S)", rest)[0]
         entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
@@ -305,17 +303,10 @@ def between(low: float, high: float, reason: str, must: str = "") -> Rule:
     return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
 
 
-def counts(
-    reason: str = "there is nothing to learn from or with otherwise",
-    least: int = 1,
-    most: int = LARGEST,
-) -> Rule:
+def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule:
     """A whole number from `least` to `most`."""
-    return rule(
-        lambda x: is_number(x) and least <= x <= most and x == x // 1,
-        f"be a whole number from {least} to {most}",
-        reason,
-    )
+    must = f"be a whole number from {least} to {most}"
+    return rule(lambda x: is_number(x) and least <= x <= most and x == x // 1, must, reason)
 
 
 def not_negative(reason: str = "it is a size") -> Rule:

@@ -10,7 +10,7 @@ import functools
 import os
 import re
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -69,8 +69,9 @@ def from_plain(
     try:
         hints = typing.get_type_hints(cls)
     except NameError as error:
-        message = f"{where} must have fields of known types; {cls.__name__} raised {told(error)}."
-        raise ConfigError(message, where) from error
+        raise ConfigError(
+            f"{where} must have fields of known types: {told(error)}.", where
+        ) from error
     defaults, fields = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
@@ -93,12 +94,8 @@ def require_typed(field: str, path: str, imports: Collection[str] | None) -> Non
       ConfigError: if it is not one of `imports`.
     """
     got = shortened(path, 60)
-    require(
-        imports is None or path in imports,
-        field,
-        "must be typed on the command line, as a module that a file names is never imported; got "
-        f"{got}. Set {field}={got}, if you trust it.",
-    )
+    message = f"must be typed, as what a file names is never imported; got {got}. Set {field}={got}"
+    require(imports is None or path in imports, field, f"{message}, if you trust it.")
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -191,28 +188,16 @@ def differences(
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
       'es.noise_std (0.1 there, 0.2 here)'
     """
-    differing = [
-        f"{name} ({shortened(old, 60)} there, {shortened(new, 60)} here)"
-        for name, old, new in _differing(there, here)
-        if name.partition(".")[0] not in free
+    old, new = flatten(there), flatten(here)
+    names = sorted(name for name in old.keys() | new.keys() if name.partition(".")[0] not in free)
+    names = [x for x in names if repr(old.get(x)) != repr(new.get(x)) and old.get(x) != new.get(x)]
+    choices = {name.removesuffix(".name") for name in names if name.endswith(".name")}
+    names = [x for x in names if x.endswith(".name") or x.rpartition(".")[0] not in choices]
+    texts = [
+        f"{name} ({shortened(old.get(name), 60)} there, {shortened(new.get(name), 60)} here)"
+        for name in names[:most]
     ]
-    more = f" and {len(differing) - most} more" if len(differing) > most else ""
-    return ", ".join(differing[:most]) + more
-
-
-def _differing(
-    there: Mapping[str, Any], here: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    for key in sorted(there.keys() | here.keys(), key=str):
-        old, new, name = there.get(key), here.get(key), f"{prefix}{key}"
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            yield from _differing(old, new, f"{name}.")
-        elif old != new and repr(old) != repr(new):  # by their texts nan is nan
-            yield name, _named(old), _named(new)
-
-
-def _named(value: Any) -> Any:
-    return value.get("name", "fields") if isinstance(value, Mapping) else value
+    return ", ".join(texts) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 # --- texts ---------------------------------------------------------------------------------------

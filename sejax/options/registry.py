@@ -235,11 +235,7 @@ def _is_one_of_many(cls: type) -> bool:
 # --- configurations ------------------------------------------------------------------------------
 
 
-def configure(
-    group: str,
-    values: Mapping[str, Any],
-    imports: Collection[str] | None = None,
-) -> Any:
+def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | None = None) -> Any:
     """The configuration that plain values describe: the field `name`, and those of the plugin.
 
     Args:
@@ -254,11 +250,9 @@ def configure(
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
       0.9
     """
-    require(
-        isinstance(values, Mapping) and "name" in values,
-        group,
-        f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME.",
-    )
+    is_choice = isinstance(values, Mapping) and "name" in values
+    message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
+    require(is_choice, group, message)
     cls = find(group, values["name"], imports)
     fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
     for field in fields.keys() - fields_of(cls).keys():
@@ -311,12 +305,9 @@ def require_package(group: str, config: Any) -> None:
       ConfigError: if it is not.
     """
     package, name = getattr(config, "package", None), name_of(group, config)
-    require(
-        package is None or importlib.util.find_spec(package) is not None,
-        group,
-        f"must be one that is installed; got {name} without the package {package}. Install it with "
-        f"pip install 'sejax[{name}]', or set {group}={next(iter(BUILT_IN[group]))}.",
-    )
+    is_there = package is None or importlib.util.find_spec(package) is not None
+    message = f"must be installed; got {name} without the package {package}. Install it with pip"
+    require(is_there, group, f"{message} install 'sejax[{name}]'.")
 
 
 # --- plugins -------------------------------------------------------------------------------------
@@ -376,13 +367,9 @@ def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
     base, arguments = _attribute(GROUPS[group].base), GROUPS[group].arguments
     if inspect.isfunction(plugin) or isinstance(plugin, functools.partial):
         return _from_function(group, name, plugin)
-    require(
-        _makes(plugin) and issubclass(plugin, base),
-        group,
-        f"must name a function, or a dataclass with make({', '.join(arguments)}) that is a subclass"
-        f" of {base.__module__}.{base.__name__}; got {shortened(name)}, which is "
-        f"{shortened(plugin)}. See docs/howto/own_pieces.md.",
-    )
+    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
+    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
+    require(_makes(plugin) and issubclass(plugin, base), group, f"{must} {shortened(plugin)}.")
     return plugin
 
 
@@ -392,12 +379,9 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     arguments, signature = GROUPS[group].arguments, inspect.signature(function)
     parameters = list(signature.parameters.values())
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
-    require(
-        len(parameters) >= len(arguments) and not is_open,
-        group,
-        f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got "
-        f"{shortened(f'{name}{signature}')}. Set {group} to such a function.",
-    )
+    must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got"
+    is_fit = len(parameters) >= len(arguments) and not is_open
+    require(is_fit, group, f"{must} {shortened(f'{name}{signature}')}.")
     options = parameters[len(arguments) :]
 
     def make(self: object, *given: object) -> Any:
@@ -421,8 +405,5 @@ def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
     """A parameter as name, type and field of a dataclass."""
     default, empty = parameter.default, inspect.Parameter.empty
     hint = Any if parameter.annotation is empty else parameter.annotation
-    if default is empty:
-        return parameter.name, hint, dataclasses.field()
-    if is_hashable(default):
-        return parameter.name, hint, dataclasses.field(default=default)
-    return parameter.name, hint, dataclasses.field(default_factory=lambda: default)
+    given = {"default": default} if is_hashable(default) else {"default_factory": lambda: default}
+    return parameter.name, hint, dataclasses.field(**({} if default is empty else given))

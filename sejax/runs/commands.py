@@ -14,8 +14,8 @@ from typing import NoReturn
 
 import yaml
 
-from sejax.options import ConfigError, FailedError, place_of, require, shortened, told
-from sejax.runs import compose, runtime
+from sejax.options import ConfigError, FailedError, place_of, told
+from sejax.runs import runtime
 from sejax.runs.config import CommandConfig, plain
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -38,7 +38,9 @@ def start(
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
     with messages():
-        overrides = _prepared(words, [*HELP, *([PRINT_CONFIG] if configs_of else [])])
+        options = [*HELP, *([PRINT_CONFIG] if configs_of else [])]
+        overrides = [word for word in words if word not in options]
+        _prepare(overrides)
         if {*HELP} & {*words}:
             print(help_text(overrides))
         elif configs_of and PRINT_CONFIG in words:
@@ -56,28 +58,15 @@ def _stop(number: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt(128 + number)
 
 
-def _prepared(words: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Sets the process up, and returns the overrides among the words.
-
-    Raises:
-      ConfigError: for an option that is none.
-    """
+def _prepare(overrides: Sequence[str]) -> None:
+    """Sets the process up."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
-    for i, word in enumerate(words):
-        require(
-            not word.startswith("-") or word in known,
-            "an override",
-            f"must read FIELD=VALUE; got {shortened(word)}. Write {compose.meant(words[i:])}, "
-            f"without dashes. Options: {', '.join(known)}.",
-        )
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")
     Path.cwd()
-    overrides = [word for word in words if not word.startswith("-")]
     runtime.configure_xla(_devices(overrides))  # before a plugin starts jax's devices
-    return overrides
 
 
 def _devices(overrides: Sequence[str]) -> int | None:

@@ -60,27 +60,23 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
     texts = {}
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
-        require(
-            equals and NAME.fullmatch(name),
-            "an override",
-            f"must read FIELD=VALUE; got {shortened(override)}. Write {meant(overrides[i:])}.",
-        )
+        if not (equals and NAME.fullmatch(name)):
+            got, field = shortened(override), "an override"
+            message = f"{field} must read FIELD=VALUE; got {got}. Write {meant(overrides[i:])}."
+            raise ConfigError(message, field)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
-        fix = f"{text.rstrip(',')}]" if is_open else first
-        require(
-            not (others or is_open),
-            name,
-            "must be one value: brackets close and hold no space, and commas outside of brackets "
-            f"and quotes make a sweep; got {shortened(text)}. Set {name}={shortened(fix)}.",
-        )
+        fix = shortened(f"{text.rstrip(',')}]" if is_open else first)
+        message = "must be one value: brackets close and hold no space, and a comma outside of them"
+        message += f" makes a sweep; got {shortened(text)}. Set {name}={fix}."
+        require(not (others or is_open), name, message)
         texts[name] = text
     return texts
 
 
 def meant(overrides: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
-    name, *values = [*filter(None, (word.strip("-=") for word in overrides[:3])), "VALUE"]
+    name, *values = [*filter(None, (word.strip("-=") for word in overrides[:3])), *["VALUE"] * 2]
     if "=" in name:  # after dashes
         return shortened(name)
     value = "VALUE" if "=" in values[0] else values[0]

@@ -32,7 +32,15 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
+from sejax.options.plain import (
+    differences,
+    fields_of,
+    flatten,
+    from_plain,
+    merge,
+    to_plain,
+    unknown_field,
+)
 from sejax.proxies import ProxyConfig, header
 from sejax.runs import preset_files
 from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, read
@@ -43,6 +51,8 @@ EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
+# Fields that the default run directory is named by.
+IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
 JOINT = "+"  # between several agents, in names
 FIX = "Set agents=[ddqn,ppo]."
 Schema = TypeVar("Schema", bound="CommandConfig")
@@ -95,10 +105,6 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
-    def field_of(self, key: str) -> str:
-        """The name of an agent's fields in words and messages."""
-        return field_of(key, self.agents)
-
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
@@ -127,10 +133,6 @@ class LearnConfig(CommandConfig):
 
     groups: ClassVar[tuple[str, ...]] = tuple(DEFAULTS)
     learns: ClassVar[bool] = True
-    # Fields that the default run directory is named by.
-    in_run_dir: ClassVar[tuple[str, ...]] = (
-        *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
-    )
 
     weights: tuple[float, ...] = option(())
     mixture: MixtureConfig = option(MixtureConfig())
@@ -153,18 +155,14 @@ class LearnConfig(CommandConfig):
         seed()("seed + num_seeds - 1", self.seed + self.num_seeds - 1, 0)
         registry.require_package("tracker", self.tracker)
         registry.require_package("machines", self.machines)
-        require(
-            self.devices is None or not getattr(self.machines, "is_elsewhere", False),
-            "devices",
-            f"must be left out with trainings on other machines; got {self.devices}. Set "
-            "machines.workers=N in its place, or machines=local.",
+        is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
+        message = (
+            f"must be left out with other machines; got {self.devices}. Set machines.workers=N."
         )
-        require(
-            not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True),
-            "stop_when_solved",
-            "must be false with an objective whose scores are not returns; got true with "
-            f"objective={self.name('objective')}. Set stop_when_solved=false.",
-        )
+        require(is_here, "devices", message)
+        is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
+        message = f"must be false with objective={self.name('objective')}, whose scores are no"
+        require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
         if not self.proxy.has_real_dynamics:
@@ -178,11 +176,6 @@ class LearnConfig(CommandConfig):
         if group == "agent":
             return JOINT.join(self.agents)
         return registry.name_of(group, getattr(self, group))
-
-    @property
-    def scored_agents(self) -> tuple[str, ...]:
-        """The agents that have scores of their own."""
-        return tuple(self.agents)
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -215,7 +208,7 @@ class LearnConfig(CommandConfig):
 
     @property
     def resolved_run_dir(self) -> Path:
-        """The run directory: by default named by `in_run_dir`."""
+        """The run directory; by default it is named by `IN_RUN_DIR`."""
         name = "-".join(map(self.name, ("env", "proxy", "agent")))
         explored, varied = self.name("exploration"), self.agent_hparams
         name += f"_{explored}" if explored != "none" else ""
@@ -255,24 +248,13 @@ class EvaluateConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, idle, default in (
-            ("agent_hparams", "as_learned", "default"),
-            ("training_from", "config", "proxy"),
-        ):
-            require(
-                self.proxy != "real" or getattr(self, name) != idle,
-                name,
-                f"must be {default} with proxy=real; got {idle}. Set {name}={default}.",
-            )
-        default, training = to_plain(TRAINING), to_plain(self.training).items()
-        changed = ", ".join(f"{k}={v}" for k, v in training if v != default[k])
+        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
+            is_idle = self.proxy == "real" and getattr(self, name) == idle
+            require(not is_idle, name, f"must be left out with proxy=real; got {idle}.")
+        changed = differences(to_plain(TRAINING), to_plain(self.training))
         fix = "" if self.proxy == "real" else "training_from=config, or "
-        require(
-            self.training_from == "config" or not changed,
-            "training",
-            "must be left as it is: agents train on an SE as it was learned with, else as "
-            f"real_training says; got {shortened(changed)}. Set {fix}real_training.*.",
-        )
+        message = f"says nothing here; got {shortened(changed)}. Set {fix}real_training.*."
+        require(self.training_from == "config" or not changed, "training", message)
 
 
 # --- what must hold of an agent -------------------------------------------------------------------
@@ -284,7 +266,7 @@ def require_fit(config: CommandConfig, key: str, spec: TaskSpec, task_name: str)
     Raises:
       ConfigError: if it cannot.
     """
-    with errors_of("agent", config.field_of(key)):
+    with errors_of("agent", field_of(key, config.agents)):
         agents.require_fit(config.agents[key], config.exploration, spec, task_name)
 
 
@@ -312,20 +294,15 @@ def require_learning(
     Raises:
       ConfigError: if it does not.
     """
-    require(
-        training.stop_rule != "solved" or training.solved_by == "test",
-        f"{group}.solved_by",
-        "must be test with stop_rule=solved, as returns on a proxy say nothing of the threshold; "
-        f"got {training.solved_by}. Set {group}.solved_by=test.",
-    )
+    field, got = f"{group}.solved_by", training.solved_by
+    message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
+    require(training.stop_rule != "solved" or got == "test", field, message)
+    field, steps = f"{group}.max_steps", training.max_steps
     limits = proxy.max_steps(spec.max_steps), spec.max_steps
     before = config.agents[key].steps_before_learning(*limits)
-    require(
-        not proxy.reaches_step_limit or training.max_steps is None or training.max_steps > before,
-        f"{group}.max_steps",
-        f"must exceed {before}, before which {shortened(key)} learns nothing; got "
-        f"{training.max_steps}. Set {group}.max_steps={4 * before}.",
-    )
+    message = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
+    is_enough = not proxy.reaches_step_limit or steps is None or steps > before
+    require(is_enough, field, f"{message} Set {field}={4 * before}.")
 
 
 # --- plain values ---------------------------------------------------------------------------------
@@ -433,12 +410,8 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
     layers, imports = compose(EvaluateConfig, overrides, _learned(read(overrides)))
-    require(
-        "proxy" in layers["typed"],
-        "proxy",
-        "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
-        "proxy=real env=cartpole.",
-    )
+    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
+    require("proxy" in layers["typed"], "proxy", message)
     return _from_plain(EvaluateConfig, merge(*layers.values()), imports)
 
 
@@ -460,24 +433,21 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
     if schema.learns:
         lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
-    parts = {name: x for name, x in vars(config).items() if dataclasses.is_dataclass(x)}
-    parts |= {"": config, "agents": parts.pop("mixture", None)}
-    texts, sources = dict[str, str](), dict[str, str]()
-    for key, agent in config.agents.items():
-        texts |= _named(config.field_of(key), help_texts(Share) | help_texts(type(agent)))
-    for prefix, part in parts.items():
-        texts |= _named(prefix, help_texts(type(part)))
+    classes = {name: type(x) for name, x in vars(config).items()}
+    classes |= {field_of(key, config.agents): type(x) for key, x in config.agents.items()}
+    classes |= {"": schema, "agents": MixtureConfig}
+    sources = dict[str, str]()
     for layer, values in layers.items():
         names = flatten(_as_words(values, config.agents))
         sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
-    fields = words_of(config)
+    fields, texts = words_of(config), dict[str, str]()
     choices = {name.removesuffix(".name") for name in fields if name.endswith(".name")}
     fields = {k: x for k, x in fields.items() if k.removesuffix(".name") not in choices}
+    for name in fields:
+        group, _, field = name.rpartition(".")
+        of_group = help_texts(Share) | help_texts(classes.get(group, Share))
+        texts |= {name: of_group[field]} if field in of_group else {}
     return "\n".join([*lines, field_lines(fields, texts, sources)])
-
-
-def _named(prefix: str, texts: Mapping[str, str]) -> dict[str, str]:
-    return {f"{prefix}.{name}".lstrip("."): text for name, text in texts.items()}
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
@@ -507,14 +477,13 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
     groups = "agent", "agents", "exploration"
     words = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
-    require(
-        not words or hparams != "as_learned" or source == "real",
-        next(iter(words), "").partition(".")[0],
-        "must be left out with agent_hparams=as_learned; got "
-        f"{shortened(', '.join(f'{k}={x}' for k, x in words.items()))}. Set agent_hparams=default.",
-    )
     if source == "real":
         return {}
+    field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
+    message = (
+        f"must be left out with agent_hparams=as_learned; got {got}. Set agent_hparams=default."
+    )
+    require(not words or hparams != "as_learned", field, message)
     stored, learned = None, dict[str, Any]()
     try:
         stored = header.read(source, "proxy").header

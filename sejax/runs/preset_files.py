@@ -76,13 +76,9 @@ def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
     sections = sections_of(env, proxy)
     if preset not in names():
         raise unknown_name("preset", preset, names())
-    require(
-        preset in sections,
-        "preset",
-        f"must be one that env={shortened(env)} has with proxy={shortened(proxy)} "
-        f"({listed(list(sections))}); got {preset}, which {listed(tuned(proxy, preset), 60)} have. "
-        "Set preset=best.",
-    )
+    there, tasks = listed(list(sections)), listed(tuned(proxy, preset), 60)
+    message = f"must be one that {shortened(env)} has ({there}); got {preset}, which {tasks} have."
+    require(preset in sections, "preset", f"{message} Set preset=best.")
     return sections[preset]
 
 

@@ -98,9 +98,9 @@ class RunProgress(Reporter):
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values, means = info.values, ""
-        if len(self._config.scored_agents) > 1:
-            each = (f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in self._config.scored_agents)
-            means = f" ({', '.join(each)})"
+        if len(self._config.agents) > 1:
+            scores = (f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in self._config.agents)
+            means = f" ({', '.join(scores)})"
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
             f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"

@@ -277,7 +277,7 @@ def open_for(config: LearnConfig, hint: str = HINT) -> RunDirectory:
     return RunDirectory(
         config.resolved_run_dir,
         configuration.plain(config),
-        config.scored_agents,
+        tuple(config.agents),
         hint,
         completed=lambda stored: configuration.completed(stored, config),
     )

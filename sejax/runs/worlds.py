@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from sejax import envs
 from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, registry, require, shortened
+from sejax.options import ConfigError, registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs.config import EvaluateConfig, require_fit, require_learning
@@ -96,23 +96,16 @@ def _load(config: EvaluateConfig) -> Proxy:
         kind = registry.configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
     proxy = load_proxy(path, task, kind, "proxy")
     name = proxy.task.name
-    require(
-        config.env in (None, name, proxy.config["env"].get("name")),
-        "env",
-        f"must be the proxy's own task; got {config.env} for a proxy of {name}. Set env={name}.",
-    )
+    is_same = config.env in (None, name, proxy.config["env"].get("name"))
+    require(is_same, "env", f"must be the proxy's own task; got {config.env}. Set env={name}.")
     return proxy
 
 
 def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
     """How long agents train on an SE, which its file says."""
-    require(
-        "training" in proxy.config,
-        "training_from",
-        "must be config for an SE whose file does not say how long agents trained on it; got "
-        f"{shortened(config.training_from)}. Set training_from=config training.stop_rule=never "
-        "training.max_steps=2000 training.max_episodes=2000.",
-    )
+    message = "must be config for an SE whose file does not say how long agents train. Set "
+    fix = "training_from=config training.max_steps=2000 training.max_episodes=2000."
+    require("training" in proxy.config, "training_from", message + fix)
     test_episodes = config.real_training.test_episodes
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
 
@@ -124,10 +117,7 @@ def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
         return config.real_training
     is_terminal = training_of(proxy).time_limit_is_terminal
     default = TrainingConfig().time_limit_is_terminal
-    require(
-        config.real_training.time_limit_is_terminal in (default, is_terminal),
-        "real_training.time_limit_is_terminal",
-        f"must be what the proxy's agents learned with; got {not default}. Leave it out, or set "
-        "agent_hparams=default.",
-    )
+    is_same = config.real_training.time_limit_is_terminal in (default, is_terminal)
+    message = "must be as the proxy's agents learned. Leave it out, or set agent_hparams=default."
+    require(is_same, "real_training.time_limit_is_terminal", message)
     return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
