@@ -302,7 +302,7 @@ def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
     texts += ["[ddqn]", "x", "ddqn", "ppo", "acrobot", "rn", "relu", "paper", "threshold", "'", "☃"]
     texts += ["a:b", "${x}", "{a:1}", "0x10", "1_000", "9" * 20, "~", "???"]
     composed = 0
-    for _ in range(300):
+    for _ in range(600):
         overrides = [f"{rng.choice(names)}={rng.choice(texts)}" for _ in range(rng.randint(1, 2))]
         try:
             config = sejax.config(overrides)

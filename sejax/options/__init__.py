@@ -25,6 +25,7 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import numbers
 import os
@@ -114,7 +115,7 @@ def listed(names: Collection[str], most: int = 120) -> str:
 
 def shortened(value: object, length: int = 80) -> str:
     """A value as text that leaves room for the rest of a message."""
-    text = str(value)
+    text = str(value).replace("\n", "\\n")
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
 
 
@@ -206,13 +207,11 @@ def check(config: Options, group: str) -> None:
 
 def traced_options(config: Options) -> dict[str, Any]:
     """Values of the fields that are traced, in the order of the dataclass."""
-    return {
-        field.name: getattr(config, field.name)
-        for field in dataclasses.fields(config)
-        if marks(type(config), field.name).get("traced")
-    }
+    names = [field.name for field in dataclasses.fields(config)]
+    return {x: getattr(config, x) for x in names if marks(type(config), x).get("traced")}
 
 
+@functools.cache
 def marks(cls: type, name: str) -> dict[str, Any]:
     """The metadata of a field: its own, else that of the class which a subclass overrides.
 

@@ -25,6 +25,7 @@ A configuration is written as plain values (`describe`) and read back (`configur
 may be is in `sejax.options.plain`.
 """
 
+import copy
 import dataclasses
 import functools
 import importlib
@@ -175,13 +176,15 @@ def find(group: str, name: object, imports: Collection[str] | None = None) -> An
         attribute that is no plugin.
     """
     text = name if isinstance(name, str) else ""
+    if text in BUILT_IN[group]:
+        return _attribute(BUILT_IN[group][text])
     path = _path_of(group, text)
     if path is None and ":" in text:
         path = text
         require_typed(group, path, imports)
     if path is None:
-        is_path = "." in text and text.replace(".", "_").isidentifier()
-        meant = [":".join(text.rsplit(".", 1))] if is_path else []
+        is_dotted = "." in text and text.replace(".", "_").isidentifier()
+        meant = [":".join(text.rsplit(".", 1))] if is_dotted else []
         raise unknown_name(group, name, [*names(group), *meant])
     cls = _as_dataclass(group, text, imported(group, path))
     if f"{cls.__module__}:{cls.__qualname__}" != text:
@@ -255,7 +258,8 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     require(is_choice, group, message)
     cls = find(group, values["name"], imports)
     fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
-    for field in fields.keys() - fields_of(cls).keys():
+    known = fields_of(cls)
+    for field in [name for name in fields if name not in known]:
         others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
         message = f"is a field of {group}={', '.join(others)}. Set one of them."
         require(not others, f"{group}.{field}", message)
@@ -347,8 +351,8 @@ def imported(field: str, path: str) -> Any:
         return _attribute(path)
     except Exception as error:
         members = vars(sys.modules.get(module, object)).items()
-        plugins = [name for name, x in members if _makes(x) or inspect.isfunction(x)]
-        plugins = [name for name in plugins if vars(sys.modules[module])[name].__module__ == module]
+        plugins = [(name, x) for name, x in members if _makes(x) or inspect.isfunction(x)]
+        plugins = [name for name, x in plugins if x.__module__ == module]
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
         if plugins:
             hint = f" Did you mean {field}={module}:{nearest(attribute, plugins)[0]}?"
@@ -387,23 +391,20 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     def make(self: object, *given: object) -> Any:
         return function(*given, **{p.name: getattr(self, p.name) for p in options})
 
+    fields = []
+    for p in options:
+        hint = Any if p.annotation is p.empty else p.annotation
+        default = {"default": p.default}
+        if not is_hashable(p.default):  # such as a list
+            default = {"default_factory": functools.partial(copy.copy, p.default)}
+        fields.append(
+            (p.name, hint, dataclasses.field(**({} if p.default is p.empty else default)))
+        )
     written: Any = getattr(function, "func", function)  # of a partial, what it is one of
     base = _attribute(GROUPS[group].base)
-    cls = dataclasses.make_dataclass(
-        written.__name__,
-        [_as_field(parameter) for parameter in options],
-        bases=(base if issubclass(base, Options) else Options,),
-        namespace={"make": make, "__doc__": written.__doc__},
-        frozen=True,
-        kw_only=True,
+    bases = (base if issubclass(base, Options) else Options,)
+    namespace = {"make": make, "__doc__": written.__doc__, "__module__": written.__module__}
+    kinds = {"frozen": True, "kw_only": True}
+    return dataclasses.make_dataclass(
+        written.__name__, fields, bases=bases, namespace=namespace, **kinds
     )
-    cls.__module__ = written.__module__
-    return cls
-
-
-def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
-    """A parameter as name, type and field of a dataclass."""
-    default, empty = parameter.default, inspect.Parameter.empty
-    hint = Any if parameter.annotation is empty else parameter.annotation
-    given = {"default": default} if is_hashable(default) else {"default_factory": lambda: default}
-    return parameter.name, hint, dataclasses.field(**({} if default is empty else given))

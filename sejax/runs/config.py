@@ -33,7 +33,6 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import (
-    differences,
     fields_of,
     flatten,
     from_plain,
@@ -251,9 +250,12 @@ class EvaluateConfig(CommandConfig):
         for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
             is_idle = self.proxy == "real" and getattr(self, name) == idle
             require(not is_idle, name, f"must be left out with proxy=real; got {idle}.")
-        changed = differences(to_plain(TRAINING), to_plain(self.training))
+        default, training = to_plain(TRAINING), to_plain(self.training).items()
+        changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
         fix = "" if self.proxy == "real" else "training_from=config, or "
-        message = f"says nothing here; got {shortened(changed)}. Set {fix}real_training.*."
+        message = (
+            f"must be left out, as it says nothing here; got {changed}. Set {fix}real_training.*."
+        )
         require(self.training_from == "config" or not changed, "training", message)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from sejax.options import ConfigError, listed, require, shortened, told, unknown_name
+from sejax.options import ConfigError, listed, shortened, told, unknown_name
 from sejax.options.plain import flatten, merge, parsed
 
 PRESETS = Path(__file__).parents[1] / "presets"
@@ -74,12 +74,13 @@ def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
     sections = sections_of(env, proxy)
+    if preset in sections:
+        return sections[preset]
     if preset not in names():
         raise unknown_name("preset", preset, names())
     there, tasks = listed(list(sections)), listed(tuned(proxy, preset), 60)
     message = f"must be one that {shortened(env)} has ({there}); got {preset}, which {tasks} have."
-    require(preset in sections, "preset", f"{message} Set preset=best.")
-    return sections[preset]
+    raise ConfigError(f"preset {message} Set preset=best.", "preset")
 
 
 def settings_of(
