@@ -1,4 +1,12 @@
-"""`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
+"""Train fresh agents on a stored proxy, and on the real task beside them; test all there.
+
+Without agent=NAME they are those that the proxy was learned with.
+
+  python -m sejax.evaluate proxy=RUN_DIR num_agents=20
+  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
+
+Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
+"""
 
 import json
 import math
@@ -20,16 +28,6 @@ from sejax.runs.config import EvaluateConfig
 from sejax.runs.progress import Tally
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
 
-ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
-
-Without agent=NAME they are those that the proxy was learned with.
-
-  python -m sejax.evaluate proxy=RUN_DIR num_agents=20
-  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
-
-Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
-"""
-
 
 def main(overrides: Sequence[str]) -> None:
     """Evaluates each configuration that the overrides describe.
@@ -46,7 +44,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
+    return f"{__doc__}\n{configuration.help_text(EvaluateConfig, overrides)}"
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:

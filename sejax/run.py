@@ -1,6 +1,14 @@
-"""`python -m sejax.run`: learn a proxy for a task.
+"""Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
+real dynamics (proxy=rn), from agents trained on nothing else.
 
-Running the same command on an existing run directory goes on where it stopped.
+  python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
+  python -m sejax.run agents=[ddqn,ppo] agents.ddqn.weight=2 agents.aggregate=min
+  python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
+  python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
+
+The same command on the same run_dir goes on where it stopped. --print-config prints the
+configuration of each run, and runs nothing.
+Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
 import contextlib
@@ -13,19 +21,6 @@ from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import open_for
-
-ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
-real dynamics (proxy=rn), from agents trained on nothing else.
-
-  python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
-  python -m sejax.run agents=[ddqn,ppo] agents.ddqn.weight=2 agents.aggregate=min
-  python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
-  python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
-
-The same command on the same run_dir goes on where it stopped. --print-config prints the
-configuration of each run, and runs nothing.
-Then: python -m sejax.evaluate proxy=RUN_DIR
-"""
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -40,7 +35,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
+    return f"{__doc__}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
@@ -59,15 +54,9 @@ def runs_of(config: LearnConfig) -> list[LearnConfig]:
     """The configuration of each seed; where `run_dir` is given, with `seed0` and so on in it."""
     if config.num_seeds == 1:
         return [config]
-    return [
-        dataclasses.replace(
-            config,
-            seed=seed,
-            num_seeds=1,
-            run_dir=config.run_dir and f"{config.run_dir}/seed{seed}",
-        )
-        for seed in range(config.seed, config.seed + config.num_seeds)
-    ]
+    seeds, folder = range(config.seed, config.seed + config.num_seeds), config.run_dir
+    folders = {seed: folder and f"{folder}/seed{seed}" for seed in seeds}
+    return [dataclasses.replace(config, seed=x, num_seeds=1, run_dir=folders[x]) for x in seeds]
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -100,11 +89,9 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     ended = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     progress.stop()
-                    message = (
-                        f"Interrupted. {directory.finished_generations} generations are saved in "
-                        f"{directory.path}; the same command goes on from there."
-                    )
-                    commands.interrupted(message, stop)
+                    saved = f"{directory.finished_generations} generations are saved"
+                    message = f"Interrupted. {saved} in {directory.path}; the same command goes on"
+                    commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if ended == "diverged":
                     diverged.append(directory.path)

@@ -368,7 +368,7 @@ def _from_plain(
     keys, weights = sorted(several.keys() - shared.keys()), []
     objects["agents"] = {}
     for key in keys:
-        where, agent = field_of(key, keys), several[key]
+        where, agent = field_of(shortened(key, 40), keys), several[key]
         agent = dict(agent) if isinstance(agent, Mapping) else {}
         is_shared = schema.learns and "weight" in agent
         share = {"weight": agent.pop("weight")} if is_shared else {}
