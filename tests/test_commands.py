@@ -79,7 +79,7 @@ def test_without_a_word_the_commands_are_listed_a_line_each(monkeypatch, capsys,
 
 
 @pytest.mark.parametrize(
-    ("word", "meant"), [("train", "sejax run."), ("env=cartpole", "sejax run env=cartpole.")]
+    ("word", "meant"), [("train", "sejax run."), ("seed=1", "sejax run seed=1.")]
 )
 def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys, word, meant):
     status, _, said = ended(monkeypatch, capsys, program.main, word)
