@@ -25,7 +25,6 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
-import functools
 import inspect
 import numbers
 import os
@@ -211,7 +210,6 @@ def traced_options(config: Options) -> dict[str, Any]:
     return {x: getattr(config, x) for x in names if marks(type(config), x).get("traced")}
 
 
-@functools.cache
 def marks(cls: type, name: str) -> dict[str, Any]:
     """The metadata of a field: its own, else that of the class which a subclass overrides.
 

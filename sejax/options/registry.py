@@ -351,11 +351,11 @@ def imported(field: str, path: str) -> Any:
         return _attribute(path)
     except Exception as error:
         members = vars(sys.modules.get(module, object)).items()
-        plugins = [(name, x) for name, x in members if _makes(x) or inspect.isfunction(x)]
-        plugins = [name for name, x in plugins if x.__module__ == module]
+        plugins = {name: x for name, x in members if _makes(x) or inspect.isfunction(x)}
+        known = [name for name, x in plugins.items() if x.__module__ == module]
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
-        if plugins:
-            hint = f" Did you mean {field}={module}:{nearest(attribute, plugins)[0]}?"
+        if known:
+            hint = f" Did you mean {field}={module}:{nearest(attribute, known)[0]}?"
         got = shortened(path, 60)
         message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
         raise ConfigError(message, field) from error

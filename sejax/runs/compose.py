@@ -215,7 +215,7 @@ def compose(
     given, stored = read(overrides), stored or {}
     imports = frozenset(registry.paths_in(overrides))
     usual = DEFAULTS | {group: stored[group]["name"] for group in schema.groups if group in stored}
-    chosen = {group: given.get(group, usual[group]) for group in schema.groups}
+    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in schema.groups}
     names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = _default_agent(given, imports)

@@ -191,8 +191,8 @@ class LearnConfig(CommandConfig):
             agents.make_agent(agent, task, self.exploration, is_varied)
             for agent in self.agents.values()
         )
-        shares = {"weights": self.weights, "config": self.mixture}
-        several = Mixture(agents=learners, names=tuple(self.agents), **shares)
+        names, weights = tuple(self.agents), self.weights
+        several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
             "task": task,
             "agent": several if len(learners) > 1 else learners[0],
