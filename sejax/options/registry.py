@@ -183,9 +183,7 @@ def find(group: str, name: object, imports: Collection[str] | None = None) -> An
         path = text
         require_typed(group, path, imports)
     if path is None:
-        is_dotted = "." in text and text.replace(".", "_").isidentifier()
-        meant = [":".join(text.rsplit(".", 1))] if is_dotted else []
-        raise unknown_name(group, name, [*names(group), *meant])
+        raise unknown_name(group, name, [*names(group), *_meant(text)])
     cls = _as_dataclass(group, text, imported(group, path))
     if f"{cls.__module__}:{cls.__qualname__}" != text:
         _NAMES[cls] = text
@@ -329,13 +327,16 @@ def require_path(field: str, path: str) -> None:
       ConfigError: if it is not.
     """
     module, _, attribute = path.partition(":")
-    dotted = module.removesuffix(".py").replace("/", ".").strip(".")
-    is_dotted = dotted.replace(".", "_").isidentifier()
-    fix = f"{dotted}:{attribute}" if is_dotted else "my_module:MyClass"
     is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
-    got, fix = shortened(path, 60), shortened(fix, 60)
+    got, fix = (shortened(x, 60) for x in (path, *_meant(path), "my_module:MyClass")[:2])
     message = f"must be a name or module:attribute; got {got}. Set {field}={fix}."
     require(is_path and not module.endswith(".py"), field, message)
+
+
+def _meant(text: str) -> list[str]:
+    """The `module:attribute` that a dotted name or the path of a file may stand for."""
+    match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
+    return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []
 
 
 def imported(field: str, path: str) -> Any:
