@@ -1,6 +1,13 @@
-"""`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
+"""Train fresh agents on a stored proxy, and on the real task beside them; test all there.
 
-import dataclasses
+Without agent=NAME they are those that the proxy was learned with.
+
+  python -m sejax.evaluate proxy=RUN_DIR num_agents=20
+  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
+
+Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
+"""
+
 import json
 import math
 import time
@@ -9,7 +16,6 @@ from typing import Any
 
 import jax
 import pandas as pd
-import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -21,16 +27,6 @@ from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
 from sejax.runs.progress import Tally
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
-
-ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
-
-Without agent=NAME they are those that the proxy was learned with.
-
-  python -m sejax.evaluate proxy=RUN_DIR num_agents=20
-  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
-
-Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
-"""
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -48,26 +44,13 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
-
-
-def config_text(overrides: Sequence[str]) -> str:
-    """What `--print-config` prints: the fields of each evaluation."""
-    plain = [configuration.plain(config) for config in configs_of(overrides)]
-    return yaml.safe_dump_all(plain, sort_keys=False)
+    return f"{__doc__}\n{configuration.help_text(EvaluateConfig, overrides)}"
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
-    configs = []
-    for of_run in compose.expand(overrides):
-        config = configuration.evaluate_config(of_run)
-        swept = compose.name_in_sweep(overrides, of_run, ("out_dir",))
-        if swept:  # or all runs of a sweep would have one folder
-            folder = f"{config.out_dir}/{swept}" if config.out_dir else f"runs/evaluate-{swept}"
-            config = dataclasses.replace(config, out_dir=folder)
-        configs.append(config)
-    return configs
+    make = configuration.evaluate_config
+    return compose.swept(overrides, make, "out_dir", lambda _, name: f"runs/evaluate-{name}")
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -89,7 +72,7 @@ def evaluate(config: EvaluateConfig) -> float:
         for key in setup.agents
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
-    summary = summarise(table, ["world", "agent"] if setup.has_several else ["world"])
+    summary = summarise(table, ["world", "agent"] if len(setup.agents) > 1 else ["world"])
     _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
@@ -102,34 +85,25 @@ def evaluate(config: EvaluateConfig) -> float:
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
     """A row for each agent of a kind."""
     env, env_params, trainings = setup.worlds[world]
-    varied = config.agent_hparams == "varied"
-    agent = make_agent(setup.agents[key], setup.task, setup.exploration, varied)
+    is_varied = config.agent_hparams == "varied"
+    agent = make_agent(setup.agents[key], setup.task, setup.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    who = f"{key} agents" if setup.has_several else "agents"
+    who = f"{key} agents" if len(setup.agents) > 1 else "agents"
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
-        outcome = jax.device_get(
-            evaluate_agents(
-                agent,
-                env,
-                env_params,
-                setup.task,
-                trainings[key],
-                keys,
-                config.num_parallel,
-                config.devices,
-                tally.add if tally.is_live else None,
-            )
-        )
-    drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
+        training, add = trainings[key], tally.add if tally.is_live else None
+        limits = config.num_parallel, config.devices
+        outcome = evaluate_agents(agent, env, env_params, setup.task, training, keys, *limits, add)
+        outcome = jax.device_get(outcome)
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
-    if setup.has_several:
+    if len(setup.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
     of_agents = {  # not of episodes, and no agreement of ranks
         name: x for name, x in vars(outcome).items() if x is not None and x.ndim == 1
     }
-    return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
+    varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
+    return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **varied})
 
 
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -148,7 +122,7 @@ def _as_json(summary: pd.DataFrame) -> str:
     """An object for each world; with several agents, in it one for each of them."""
     if summary.index.nlevels == 1:
         return str(summary.to_json(orient="index", indent=2))
-    worlds = summary.index.get_level_values("world").unique()
+    worlds = summary.index.unique("world")
     nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
     return json.dumps(nested, indent=2)
 
@@ -160,7 +134,8 @@ def spread(mean: float, std: float, digits: int) -> str:
 
 def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
-    who = "agents of each kind" if setup.has_several else f"{next(iter(setup.agents))} agents"
+    (first, *others) = setup.agents
+    who = "agents of each kind" if others else f"{first} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]
@@ -183,4 +158,4 @@ def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) ->
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, config_text)
+    commands.start(main, help_text, configs_of)

@@ -1,22 +1,4 @@
-"""`python -m sejax.run`: learn a proxy for a task.
-
-Running the same command on an existing run directory goes on where it stopped.
-"""
-
-import contextlib
-import dataclasses
-from collections.abc import Sequence
-
-import yaml
-
-from sejax.options import FailedError
-from sejax.runs import commands, compose, runtime, session
-from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig
-from sejax.runs.progress import RunProgress
-from sejax.runs.run_directory import RunDirectory
-
-ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
+"""Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
 real dynamics (proxy=rn), from agents trained on nothing else.
 
   python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
@@ -28,6 +10,17 @@ The same command on the same run_dir goes on where it stopped. --print-config pr
 configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+
+from sejax.options import FailedError
+from sejax.runs import commands, compose, runtime, session
+from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
+from sejax.runs.progress import RunProgress
+from sejax.runs.run_directory import open_for
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -42,43 +35,28 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
-
-
-def config_text(overrides: Sequence[str]) -> str:
-    """What `--print-config` prints: the `config.yaml` of each run."""
-    plain = [configuration.plain(config) for config in configs_of(overrides)]
-    return yaml.safe_dump_all(plain, sort_keys=False)
+    return f"{__doc__}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     """The configuration of each run that the overrides describe, with folders of their own."""
-    configs = []
-    for of_run in compose.expand(overrides):
-        config = configuration.config(of_run)
-        given = config.run_dir
-        known = LearnConfig.in_run_dir if given is None else ("run_dir",)
-        swept = compose.name_in_sweep(overrides, of_run, known)
-        if swept:  # or all runs of a sweep would have one folder
-            folder = f"{config.resolved_run_dir}_{swept}" if given is None else f"{given}/{swept}"
-            config = dataclasses.replace(config, run_dir=folder)
-        configs += runs_of(config)
-    return configs
+    configs = compose.swept(
+        overrides,
+        configuration.config,
+        "run_dir",
+        lambda config, name: f"{config.resolved_run_dir}_{name}",
+        configuration.IN_RUN_DIR,
+    )
+    return [of_seed for config in configs for of_seed in runs_of(config)]
 
 
 def runs_of(config: LearnConfig) -> list[LearnConfig]:
     """The configuration of each seed; where `run_dir` is given, with `seed0` and so on in it."""
     if config.num_seeds == 1:
         return [config]
-    return [
-        dataclasses.replace(
-            config,
-            seed=seed,
-            num_seeds=1,
-            run_dir=config.run_dir and f"{config.run_dir}/seed{seed}",
-        )
-        for seed in range(config.seed, config.seed + config.num_seeds)
-    ]
+    seeds, folder = range(config.seed, config.seed + config.num_seeds), config.run_dir
+    folders = {seed: folder and f"{folder}/seed{seed}" for seed in seeds}
+    return [dataclasses.replace(config, seed=x, num_seeds=1, run_dir=folders[x]) for x in seeds]
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -106,16 +84,14 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     if program != compiled:
                         machines.close()
                         runtime.configure_jax()
-                        made = config.machines.make(config)
-                        compiled, chunks = program, machines.enter_context(made)
+                        chunks = machines.enter_context(config.machines.make(config))
+                        compiled = program
                     ended = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     progress.stop()
-                    message = (
-                        f"Interrupted. {directory.finished_generations} generations are saved in "
-                        f"{directory.path}; the same command goes on from there."
-                    )
-                    commands.interrupted(message, stop)
+                    saved = f"{directory.finished_generations} generations are saved"
+                    message = f"Interrupted. {saved} in {directory.path}; the same command goes on"
+                    commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if ended == "diverged":
                     diverged.append(directory.path)
@@ -135,4 +111,4 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, config_text)
+    commands.start(main, help_text, configs_of)

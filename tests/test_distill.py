@@ -157,7 +157,7 @@ def test_defaults_are_those_of_the_task():
     assert read(["env=hopper", "search.alive_bonus=0"])[0].search.alive_bonus == 0.0
     assert read(["env=halfcheetah"])[0].search.alive_bonus == 0.0
     config = read(["env=cartpole", "training.max_steps=700"])[1]
-    assert config.training.max_episodes == 700 and list(config.scored_agents) == ["ddqn", "ppo"]
+    assert config.training.max_episodes == 700 and list(config.agents) == ["ddqn", "ppo"]
 
 
 @pytest.mark.parametrize(("words", "name"), [

@@ -1,12 +1,12 @@
 """`python -m sejax.evaluate`: fresh agents on a stored proxy, and on the real task."""
 
-import contextlib
 import dataclasses
 import functools
-import io
+import itertools
 import json
 import pickle
 import sys
+from pathlib import Path
 
 import gymnax
 import jax
@@ -27,22 +27,16 @@ from sejax.runs import config as configuration
 from sejax.runs import plots, progress
 from sejax.runs.worlds import proxy_setup
 
-TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
-        "real_training.max_episodes=2"]  # fmt: skip
-SOFT = (
-    "proxy.done=soft",
-    "proxy.horizon=null",
-)  # an SE whose episodes may be as long as the task's
-ROOM = [
-    "agent=q_learning",
-    "num_agents=2",
-    "real_training.max_episodes=2",
-    "devices=1",
-]  # tables compile fast
+# An SE for DDQN agents, whose episodes may be as long as the task's.
+SE = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", "proxy.done=soft",
+      "proxy.horizon=null")  # fmt: skip
+# An SE for tables, which compile fast, learned with 50 steps; and how they are evaluated.
+ROOM_SE = ("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")
+ROOM = ("num_agents=2", "real_training.max_episodes=2", "devices=1")
 
 
-def evaluate_config(*overrides, words=TINY):
-    return configuration.evaluate_config([*words, *overrides])
+def evaluate_config(*overrides):
+    return configuration.evaluate_config(overrides)
 
 
 @functools.cache
@@ -63,69 +57,61 @@ def save(path, *words):
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     """The file of an SE for DDQN agents."""
-    path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
-    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", *SOFT)
-    return save(path, *words)
+    return save(tmp_path_factory.mktemp("proxy") / "proxy.safetensors", *SE)
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """The file of an SE for tables, learned with 50 steps."""
-    path = tmp_path_factory.mktemp("room") / "proxy.safetensors"
-    words = ("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")
-    return save(path, *words)
+    """The file of an SE for tables."""
+    return save(tmp_path_factory.mktemp("room") / "proxy.safetensors", *ROOM_SE)
 
 
-@pytest.fixture(scope="module")
-def evaluated(stored, tmp_path_factory):
-    """A whole evaluation: its mean return, its folder and what it printed."""
-    out_dir, printed = tmp_path_factory.mktemp("evaluated"), io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        mean = evaluate(evaluate_config(f"proxy={stored}", f"out_dir={out_dir}"))
-    return mean, out_dir, printed.getvalue()
+def evaluated(*words):
+    """The mean return, rows and summary of an evaluation, which is in `out_dir`."""
+    config = evaluate_config(*words)
+    mean, folder = evaluate(config), Path(config.out_dir)
+    assert is_drawn(folder / "evaluation.png")
+    summary = json.loads((folder / "evaluation.json").read_text())
+    return mean, pd.read_csv(folder / "evaluation.csv"), summary
 
 
-def test_evaluation_writes_a_row_for_each_agent_and_their_means(evaluated):
-    mean, out_dir, printed = evaluated
-    table = pd.read_csv(out_dir / "evaluation.csv")
-    assert table.groupby("world").size().to_dict() == {"the proxy": 3, "the real task": 3}
-    assert mean == pytest.approx(table[table.world == "the proxy"].test_return.mean(), rel=1e-5)
-    summary = json.loads((out_dir / "evaluation.json").read_text())
-    steps = table[table.world == "the real task"].train_steps.mean()
-    assert summary["the real task"]["train_steps_mean"] == pytest.approx(steps)
-    assert (out_dir / "evaluation.png").stat().st_size > 10_000
-    assert "3 fresh ddqn agents" in printed
+def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, capsys):
+    words = f"proxy={room}", "agent=q_learning", *ROOM, f"out_dir={tmp_path}"
+    mean, table, summary = evaluated(*words)
+    assert table.groupby("world").size().to_dict() == {"the proxy": 2, "the real task": 2}
+    on_proxy, on_task = (table[table.world == world] for world in ("the proxy", "the real task"))
+    assert mean == pytest.approx(on_proxy.test_return.mean(), rel=1e-5)
+    assert (on_proxy.train_steps == 50).all()  # as the proxy was learned
+    steps = summary["the real task"]["train_steps_mean"]
+    assert steps == pytest.approx(on_task.train_steps.mean())
+    printed = capsys.readouterr().out  # in a pipe
+    assert "2 fresh q_learning agents" in printed
+    assert "training 2 agents on the proxy ...\n" in printed
 
 
 def test_several_agents_are_in_one_table(room, tmp_path, capsys):
-    words = ["agents=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
-    mean = evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}", words=words))
-    table = pd.read_csv(tmp_path / "evaluation.csv")
+    words = "agents=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", f"out_dir={tmp_path}"
+    mean, table, summary = evaluated(f"proxy={room}", *words, *ROOM)
+    worlds, agents = ("the proxy", "the real task"), ("q_learning", "sarsa")
     counts = table.groupby(["world", "agent"]).size().to_dict()
-    assert counts == dict.fromkeys(
-        [(world, agent) for world in ("the proxy", "the real task")
-         for agent in ("q_learning", "sarsa")], 2,
-    )  # fmt: skip
+    assert counts == dict.fromkeys(itertools.product(worlds, agents), 2)
     assert mean == pytest.approx(table[table.world == "the proxy"].test_return.mean(), rel=1e-5)
-    summary = json.loads((tmp_path / "evaluation.json").read_text())
     of_sarsa = table[(table.world == "the real task") & (table.agent == "sarsa")]
-    assert summary["the real task"]["sarsa"]["train_steps_mean"] == pytest.approx(
-        of_sarsa.train_steps.mean()
-    )
+    steps = summary["the real task"]["sarsa"]["train_steps_mean"]
+    assert steps == pytest.approx(of_sarsa.train_steps.mean())
     printed = capsys.readouterr().out
     assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
-    assert is_drawn(tmp_path / "evaluation.png")
 
 
 @pytest.mark.slow
 def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, monkeypatch):
     added, add = [], progress.Tally.add
     monkeypatch.setattr(progress.Tally, "add", lambda self: (added.append(self._total), add(self)))
-    words = [f"proxy={room}", "num_agents=3"]
-    evaluate(evaluate_config(*words, f"out_dir={tmp_path}/quiet", words=ROOM))
+    words = f"proxy={room}", *ROOM, "agent=q_learning", "num_agents=3"
+    evaluated(*words, f"out_dir={tmp_path}/quiet")
     assert not added
     monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    evaluate(evaluate_config(*words, f"out_dir={tmp_path}/live", words=ROOM))
+    evaluated(*words, f"out_dir={tmp_path}/live")
     quiet, live = (tmp_path / name / "evaluation.csv" for name in ("quiet", "live"))
     assert live.read_bytes() == quiet.read_bytes() and added == [3] * 6
 
@@ -133,13 +119,11 @@ def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, mon
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
-    config = evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x", words=ROOM)
-    assert refused(evaluate, config) == "out_dir"
-
-
-def test_agents_train_as_the_proxy_was_learned(evaluated):
-    table = pd.read_csv(evaluated[1] / "evaluation.csv")
-    assert (table[table.world == "the proxy"].train_steps == 50).all()
+    assert refused(evaluate, evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x")) == (
+        "out_dir"
+    )
+    require_writable("out_dir", tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()  # it leaves nothing there
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
@@ -168,118 +152,96 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
 
 
 def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
-    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0",
-             "proxy.horizon=1")  # fmt: skip
-    proxy = sejax.load_proxy(save(tmp_path / "proxy.safetensors", *words))
+    proxy = sejax.load_proxy(save(tmp_path / "proxy.safetensors", *SE[:3], "proxy.horizon=1"))
     later = dataclasses.replace(proxy.learned_with("agent"), warmup_episodes=3)
     assert sejax.training_of(proxy, later).max_steps == 53
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     """An SE learned with two families: neither they nor others wait beyond their budget."""
-    words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.warmup_episodes=2",
-             "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
+    words = ("agents=[ddqn,ppo]", "agents.ddqn.warmup_episodes=2", "agents.ppo.rollout_steps=100",
+             "proxy.hidden_size=4", "training.max_steps=4000", *SE[3:])  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    composed = evaluate_config(f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]",
-                               "agents.dueling_ddqn.warmup_episodes=10",
-                               "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
-    budgets = {
-        key: training.max_steps
-        for key, training in proxy_setup(composed).worlds["the proxy"][2].items()
-    }
+    setup = proxy_setup(evaluate_config(
+        f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]", "agents.dueling_ddqn.warmup_episodes=10",
+        "agents.ppo.rollout_steps=null"))  # fmt: skip
+    budgets = {key: x.max_steps for key, x in setup.worlds["the proxy"].trainings.items()}
     # Learned with 4000 steps, of which DDQN waits 2 * 200; others wait 10 episodes.
     waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
+    as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned"))
     assert as_learned.agents == learned(*words)[0].agents
-    assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
+    assert as_learned.worlds["the proxy"].trainings["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
-@pytest.mark.parametrize(
-    ("proxy", "words", "field"),
-    [
-        ("stored", "training_from=config training.solved_by=train training.stop_rule=solved",
-         "training.solved_by"),
-        ("stored", "training_from=config training.max_steps=300 agent.warmup_episodes=2",
-         "training.max_steps"),
-        ("stored", "env=acrobot", "env"),
-        ("room", "agent=ddqn", "agent"),
-        ("cartpole-rn", "real_training.solved_by=train", "real_training.solved_by"),
-        ("real", "env=cartpole agent=q_learning", "agent"),
-        ("real", "seed=1", "env"),
-        ("nope", "seed=1", "proxy"),
-        ("nope/proxy.safetensors", "seed=1", "proxy"),
-        ("d" * 10_000, "seed=1", "proxy"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("proxy", "words", "field"), [
+    ("stored", "training_from=config training.solved_by=train training.stop_rule=solved",
+     "training.solved_by"),
+    ("stored", "training_from=config training.max_steps=300 agent.warmup_episodes=2",
+     "training.max_steps"),
+    ("cartpole-rn", "real_training.solved_by=train", "real_training.solved_by"),
+    ("stored", "env=acrobot", "env"), ("room", "agent=ddqn", "agent"), ("real", "seed=1", "env"),
+    ("real", "env=cartpole agent=q_learning", "agent"), ("nope", "seed=1", "proxy"),
+    ("nope/proxy.safetensors", "seed=1", "proxy"), ("d" * 10_000, "seed=1", "proxy"),
+])  # fmt: skip
 def test_what_cannot_be_trained_is_refused_before_anything_starts(
     proxy, words, field, stored, room, monkeypatch
 ):
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
     path = {"stored": stored, "room": room}.get(proxy, proxy)
-    config = evaluate_config(f"proxy={path}", *words.split(), words=[])
-    assert refused(evaluate, config) == field
+    assert refused(evaluate, evaluate_config(f"proxy={path}", *words.split())) == field
 
 
 def test_one_agent_has_no_deviation(tmp_path, capsys):
-    overrides = ["proxy=real", "env=gridworld_2x2", "num_agents=1", f"out_dir={tmp_path}"]
-    evaluate(evaluate_config(*overrides, words=ROOM))
+    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1", f"out_dir={tmp_path}"
+    _, table, _ = evaluated(*words)
     printed = capsys.readouterr().out
     assert "nan" not in printed and "1 fresh q_learning agents" in printed
-    # The real task alone can be evaluated.
-    assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
+    assert set(table.world) == {"the real task"}  # which alone can be evaluated
 
 
-def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(tmp_path):
+@pytest.mark.parametrize(("word", "expected"), [("agent_hparams=as_learned", False),
+                                               ("agent=td3", True)])  # fmt: skip
+def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(word, expected, tmp_path):
     """Pendulum's bootstrap there; on the real task beside the RN they do likewise."""
     path = save(tmp_path / "proxy.safetensors", "env=pendulum", "proxy=rn")
-    words = [f"proxy={path}", f"out_dir={tmp_path}"]
-    for given, expected in (["agent_hparams=as_learned"], False), (["agent=td3"], True):
-        setup = proxy_setup(evaluate_config(*words, *given, words=[]))
-        for _, _, trainings in setup.worlds.values():
-            assert trainings["td3"].time_limit_is_terminal == expected
+    for world in proxy_setup(evaluate_config(f"proxy={path}", word)).worlds.values():
+        assert world.trainings["td3"].time_limit_is_terminal == expected
 
 
 def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, tmp_path):
     """Tests on the real task, by which agents there stop, are not for an SE."""
-    proxies = sejax.load_set(room)
-    bare = tmp_path / "bare.safetensors"
+    proxies, bare = sejax.load_set(room), tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights)
-    words = [f"proxy={bare}", "num_agents=1", "baseline=false", f"out_dir={tmp_path}"]
-    assert refused(proxy_setup, evaluate_config(*words, words=ROOM)) == "training_from"
-    given = ["training_from=config", "training.max_steps=7", "training.stop_rule=never"]
-    setup = proxy_setup(evaluate_config(*words, *given, words=ROOM))
-    assert setup.worlds["the proxy"][2]["q_learning"].max_steps == 7
+    words = f"proxy={bare}", "agent=q_learning", "baseline=false"
+    assert refused(proxy_setup, evaluate_config(*words)) == "training_from"
+    given = "training_from=config", "training.max_steps=7", "training.stop_rule=never"
+    setup = proxy_setup(evaluate_config(*words, *given))
+    ((name, world),) = setup.worlds.items()
+    assert name == "the proxy" and world.trainings["q_learning"].max_steps == 7
 
 
-def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
+def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     """An RN learned with Q-learning agents and a count-based bonus."""
-    words = ("env=cliff_walking", "proxy=rn", "exploration=count_based")
+    words = "env=cliff_walking", "proxy=rn", "exploration=count_based"
     path = save(tmp_path / "proxy.safetensors", *words)
-    config = learned(*words)[0]
-    overrides = [f"proxy={path}", "agent_hparams=as_learned", "num_agents=2", "baseline=false",
-                 "devices=1", "real_training.max_episodes=2"]  # fmt: skip
-    composed = evaluate_config(*overrides, words=[])
-    setup = proxy_setup(composed)
-    assert setup.agents == config.agents and setup.exploration == config.exploration
+    config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
+    setup, learner = proxy_setup(config), learned(*words)[0]
+    assert (setup.agents, setup.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
-    assert setup.worlds["the proxy"][2] == {"q_learning": composed.real_training}
-    evaluate(composed)
-    assert "2 fresh q_learning agents" in capsys.readouterr().out
+    assert setup.worlds["the proxy"].trainings == {"q_learning": config.real_training}
 
 
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
-    config = learned("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")[0]
-    proxies = sejax.load_set(room)
+    config, proxies = learned(*ROOM_SE)[0], sejax.load_set(room)
     for group in ("agent", "exploration", "es", "objective"):
         assert proxies.learned_with(group) == getattr(config, group)
     assert sejax.training_of(proxies) == config.training
     bare = tmp_path / "bare.safetensors"
-    sejax.save(bare, proxies.env, proxies[0].params.weights)
-    assert refused(sejax.load_proxy(bare).learned_with, "agent") == "agent"
-    sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
-    assert "got my:Agent" in str(refusal(sejax.load_proxy(bare).learned_with, "agent"))
+    for stored in ({}, {"agent": {"name": "my:Agent"}}):
+        sejax.save(bare, proxies.env, proxies[0].params.weights, stored)
+        assert refused(sejax.load_proxy(bare).learned_with, "agent") == "agent"
     assert "my" not in sys.modules
 
 
@@ -293,15 +255,14 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
                         (f"acrobot {own}", "ddqn"),
                         (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
                         ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
-        config = evaluate_config(*f"proxy={proxy}".split(), words=[])
-        assert registry.name_of("agent", config.agent) == kind
+        config = evaluate_config(*f"proxy={proxy}".split())
         assert config.agent == registry.configure("agent", {"name": kind})
     # An older file, which lacks that: its task's name is not imported, nor made.
     path = tmp_path / "theirs.safetensors"
     tensors, header = unpack(path.read_bytes(), "sejax")
     header.pop("interface")
     path.write_bytes(pack(tensors, "sejax", header))
-    assert registry.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
+    assert evaluate_config(f"proxy={path}").agent == sejax.DDQNConfig()
     assert "their" not in sys.modules
 
 
@@ -319,16 +280,6 @@ def test_a_test_that_may_never_end_is_refused_beside_the_training_budget():
     training = sejax.TrainingConfig(max_steps=60, max_episodes=60)
     error = refusal(make_evaluator, agent, env, task, training)
     assert error.field == "env.max_steps" and "of 60 steps" in str(error)
-
-
-def test_an_evaluation_in_a_pipe_says_what_it_trains_and_leaves_no_folder_if_refused(
-    room, tmp_path, capsys
-):
-    evaluate(evaluate_config(f"proxy={room}", "num_agents=2", f"out_dir={tmp_path}", words=ROOM))
-    said = capsys.readouterr().out
-    assert "training 2 agents on the proxy ...\n" in said
-    require_writable("out_dir", tmp_path / "a" / "b")
-    assert not (tmp_path / "a").exists()
 
 
 def test_pickling_an_agent_says_what_to_send_in_its_place():

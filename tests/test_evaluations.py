@@ -1,6 +1,6 @@
 """sejax.es.base: how often candidates are evaluated, and how their scores combine."""
 
-import functools
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -29,30 +29,21 @@ def seeds(config):
     return numbers
 
 
-@pytest.mark.parametrize("make", [functools.partial(NESConfig, population_size=3),
-                                  functools.partial(EvosaxConfig, population_size=4)])  # fmt: skip
-def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(make):
-    numbers = seeds(make(num_evals=2, num_incumbent_evals=3))
+@pytest.mark.parametrize(("cls", "size"), [(NESConfig, 3), (EvosaxConfig, 4)])
+def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls, size):
+    config = cls(population_size=size, num_evals=2, num_incumbent_evals=3)
+    numbers = seeds(config)
     assert len(np.unique(numbers)) == len(numbers)
     # Two evaluations: seeds 0 and 1 for each candidate; the incumbent's 0, 1, 2.
-    shared = seeds(make(num_evals=2, num_incumbent_evals=3, common_random_numbers=True))
-    first, second, third = shared[-3:]
-    np.testing.assert_array_equal(
-        shared[:-3].reshape(-1, 2), [[first, second]] * (len(shared) // 2 - 1)
-    )
-    assert len({first, second, third}) == 3
+    *shared, first, second, third = seeds(dataclasses.replace(config, common_random_numbers=True))
+    assert shared == [first, second] * (len(shared) // 2) and len({first, second, third}) == 3
 
 
-@pytest.mark.parametrize("config", [
-    NESConfig(population_size=4, num_evals=3, num_incumbent_evals=5, eval_aggregate="min",
-              common_random_numbers=True),
-    EvosaxConfig(population_size=4, num_evals=3, num_incumbent_evals=5, eval_aggregate="min",
-                 common_random_numbers=True),
-])  # fmt: skip
-def test_a_strategy_has_the_configured_evaluations(config):
-    assert config.make(6).evaluations == Evaluations(
-        num_evals=3, aggregate="min", num_incumbent_evals=5, common_random_numbers=True
-    )
+@pytest.mark.parametrize("make", [NESConfig, EvosaxConfig])
+def test_a_strategy_has_the_configured_evaluations(make):
+    shared = {"num_evals": 3, "num_incumbent_evals": 5, "common_random_numbers": True}
+    config = make(population_size=4, eval_aggregate="min", **shared)
+    assert config.make(6).evaluations == Evaluations(aggregate="min", **shared)
 
 
 # --- what is evaluated, and its scores -----------------------------------------------------------

@@ -248,7 +248,7 @@ def test_results_are_apart_from_what_may_be_deleted(words, folder, work):
 @pytest.mark.parametrize(
     ("word", "field"),
     [("agents=[dqn]", "agents"), ("agents=ddqn,ppo", "agents"), ("num_agents=0", "num_agents"),
-     ("num_agents=many", "num_agents"), ("numagents=3", "numagents"), ("quick", ""),
+     ("num_agents=many", "num_agents"), ("numagents=3", "numagents"), ("quick", "an override"),
      ("run.env=acrobot", "run.env"), ("run.seed=3", "run.seed")],  # else filed as CartPole's
 )  # fmt: skip
 def test_words_that_cannot_work_are_refused(word, field):

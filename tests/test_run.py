@@ -28,7 +28,8 @@ OWN = [*ROOM, "seed=12"]
 TINY = [*OWN, "agent.learning_rate=0.5"]
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
-START = functools.partial(commands.start, run.main, run.help_text, run.config_text)
+RUN = [sys.executable, "-m", "sejax.run"]
+START = functools.partial(commands.start, run.main, run.help_text, run.configs_of)
 
 
 @functools.cache

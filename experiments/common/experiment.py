@@ -20,9 +20,9 @@ import pandas as pd
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, Rule, as_text, require, shortened
+from sejax.options import Rule, as_text, require, shortened
 from sejax.options.plain import from_plain, parsed
-from sejax.runs import commands, runtime
+from sejax.runs import commands, compose, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
@@ -171,19 +171,11 @@ def parse(words: Iterable[str]) -> dict[str, Any]:
     Raises:
       ConfigError: for anything else.
     """
-    given: dict[str, Any] = {}
-    runs = []
-    for word in words:
-        name, equals, text = word.partition("=")
-        if not equals:
-            raise ConfigError(f"An override must read FIELD=VALUE; got {shortened(word)}.")
-        if name.startswith(RUN_PREFIX):
-            runs.append(word.removeprefix(RUN_PREFIX))
-        else:
-            given[name] = parsed(text)
-    if runs:
-        given["run"] = [*(given.get("run") or []), *runs]
-    return given
+    texts = compose.words(list(words))
+    given = {name: parsed(text) for name, text in texts.items() if not name.startswith(RUN_PREFIX)}
+    of_runs = [name for name in texts if name.startswith(RUN_PREFIX)]
+    run = [f"{name.removeprefix(RUN_PREFIX)}={texts[name]}" for name in of_runs]
+    return given | ({"run": [*(given.get("run") or []), *run]} if run else {})
 
 
 @dataclass(frozen=True, kw_only=True)

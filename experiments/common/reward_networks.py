@@ -43,7 +43,7 @@ VARIANTS = (
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
 PAPER_ROWS = ("default", "varied", "transfer")
-OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
+OBJECTIVES = tuple(registry.BUILT_IN["objective"])
 
 
 @dataclass(frozen=True, kw_only=True)

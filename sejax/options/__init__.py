@@ -25,7 +25,6 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
-import difflib
 import inspect
 import numbers
 import os
@@ -35,12 +34,15 @@ import textwrap
 import traceback
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable
+from collections import ChainMap
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, ClassVar
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
 MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
+NOTHING = "there is nothing to learn from or with otherwise"
 MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
@@ -63,16 +65,21 @@ class ConfigError(ValueError):
         super().__init__(message)
         self.field = field
 
-    def moved(self, group: str, where: str) -> "ConfigError":
-        """The same error of fields that stand elsewhere, as `agents.ddqn` for `agent`."""
-        if group in ("", where):
-            return self
-        at_fault = re.sub(rf"^{group}\b", where, self.field)
-        return ConfigError(re.sub(rf"\b{group}(?=\.\w| must )", where, str(self)), at_fault)
-
 
 class FailedError(RuntimeError):
     """Computing that cannot go on. Commands print its message and exit with status 1."""
+
+
+@contextlib.contextmanager
+def errors_of(group: str, where: str) -> Iterator[None]:
+    """Errors about a group in here name the place where it stands, as `agents.ddqn` for `agent`."""
+    try:
+        yield
+    except ConfigError as error:
+        if group in ("", where):
+            raise
+        message = re.sub(rf"\b{group}(?=\.\w| must )", where, str(error))
+        raise ConfigError(message, re.sub(rf"^{group}\b", where, error.field)) from None
 
 
 def require(holds: object, field: str, message: str) -> None:
@@ -90,22 +97,14 @@ def require(holds: object, field: str, message: str) -> None:
 def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
-    return ConfigError(
-        f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}. "
-        f"Did you mean {field}={ranked[0]}?",
-        field,
-    )
+    message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
+    return ConfigError(f"{message} Did you mean {field}={ranked[0]}?", field)
 
 
 def nearest(got: object, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
-    start = str(got)[:200]  # comparing takes time that grows with the square of the length
-
-    def similarity(name: str) -> float:  # where the case differs, the letters count
-        pairs = (start, name), (start.lower(), name.lower())
-        return sum(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
-
-    return sorted(known, key=similarity, reverse=True)
+    text = str(got)[:200].lower()  # comparing takes time that grows with the square of the length
+    return sorted(known, key=lambda name: -SequenceMatcher(None, text, name.lower()).ratio())
 
 
 def listed(names: Collection[str], most: int = 120) -> str:
@@ -115,18 +114,18 @@ def listed(names: Collection[str], most: int = 120) -> str:
 
 def shortened(value: object, length: int = 80) -> str:
     """A value as text that leaves room for the rest of a message."""
-    text = str(value)
+    text = str(value).replace("\n", "\\n")
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
 
 
 def told(error: BaseException) -> str:
     """An error of other code on one line: its kind, its message, its place in a user's file."""
-    place, text = place_of(error), shortened(" ".join(str(error).split()), 120)
-    kinds = [cls.__name__ for cls in type(error).__mro__]
+    line, text = place_of(error), shortened(" ".join(str(error).split()), 120)
+    classes = [cls.__name__ for cls in type(error).__mro__]
     # jax's errors of a value that is not known while tracing; their texts tell of jax's inside.
-    if any(kind.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for kind in kinds):
+    if any(name.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for name in classes):
         text = "Python code needs the value of a traced array; use jnp.where, or jax.numpy"
-    return f"{kinds[0]}: {text}{f' ({place})' if place else ''}"
+    return f"{classes[0]}: {text}{f' ({line})' if line else ''}"
 
 
 def place_of(error: BaseException) -> str:
@@ -135,13 +134,13 @@ def place_of(error: BaseException) -> str:
     Python's library, installed packages and sejax are not the user's own.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith(("<", *_LIBRARIES))]
-    if not own:
+    users = [frame for frame in frames if not frame.filename.startswith(("<", *_LIBRARIES))]
+    if not users:
         return ""
-    path = Path(own[-1].filename)
+    path = Path(users[-1].filename)
     with contextlib.suppress(OSError, ValueError):  # it is elsewhere
         path = path.relative_to(Path.cwd())
-    return f"{path}:{own[-1].lineno}: {shortened(own[-1].line, 60)}"
+    return f"{path}:{users[-1].lineno}: {shortened(users[-1].line, 60)}"
 
 
 _LIBRARIES = (
@@ -200,12 +199,10 @@ def check(config: Options, group: str) -> None:
       ConfigError: for the first one that does not hold.
     """
     for field in dataclasses.fields(config):
-        given = getattr(config, field.name)
-        value = as_python(given)
+        value = as_python(getattr(config, field.name))
         if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
             value = float(value)
-        if value is not given:
-            object.__setattr__(config, field.name, value)
+        object.__setattr__(config, field.name, value)
         rule = marks(type(config), field.name).get("rule")
         may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
         if rule is not None and not (value is None and may_be_none):
@@ -214,11 +211,8 @@ def check(config: Options, group: str) -> None:
 
 def traced_options(config: Options) -> dict[str, Any]:
     """Values of the fields that are traced, in the order of the dataclass."""
-    return {
-        field.name: getattr(config, field.name)
-        for field in dataclasses.fields(config)
-        if marks(type(config), field.name).get("traced")
-    }
+    names = [field.name for field in dataclasses.fields(config)]
+    return {x: getattr(config, x) for x in names if marks(type(config), x).get("traced")}
 
 
 def marks(cls: type, name: str) -> dict[str, Any]:
@@ -226,18 +220,33 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
     So that `warmup_episodes: int = 5` in a subclass changes the default alone.
     """
-    found: dict[str, Any] = {}
-    for base in reversed(cls.__mro__):
-        field = vars(base).get("__dataclass_fields__", {}).get(name)
-        found |= dict(field.metadata) if field is not None else {}
-    return found
+    fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
+    return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
+
+
+def field_lines(
+    values: Mapping[str, Any], texts: Mapping[str, str], sources: Mapping[str, str] | None = None
+) -> str:
+    """Lines of `--help`: each field with its value, its text, and where its value comes from.
+
+    Args:
+      values: plain values by the fields' names.
+      texts: from `help_texts`, by the same names.
+      sources: what stands behind a field's text, such as the layer that its value is from.
+    """
+    lines = []
+    for name, value in values.items():
+        about = f"  # {texts[name]}" if name in texts else ""
+        line = f"  {name}={as_text(value)}{about}{(sources or {}).get(name, '')}"
+        lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
+    return "\n".join(lines)
 
 
 def help_texts(cls: type) -> dict[str, str]:
     """What the docstrings of a class and its bases say of its attributes, by their names."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        _, _, rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")
+        rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
         section = re.split(r"\n\n(?=\S)", rest)[0]
         entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
@@ -268,8 +277,9 @@ def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
     """The rule that a predicate holds; see `require`."""
 
     def apply(name: str, value: Any, default: Any) -> None:
-        got, fix = shortened(value), f"{name}={as_text(default)}"
-        require(holds(value), name, f"must {must}, because {reason}; got {got}. Set {fix}.")
+        if not holds(value):
+            got, fix = shortened(value), f"{name}={as_text(default)}"
+            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
 
     return apply
 
@@ -295,17 +305,10 @@ def between(low: float, high: float, reason: str, must: str = "") -> Rule:
     return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
 
 
-def counts(
-    reason: str = "there is nothing to learn from or with otherwise",
-    least: int = 1,
-    most: int = LARGEST,
-) -> Rule:
+def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule:
     """A whole number from `least` to `most`."""
-    return rule(
-        lambda x: is_number(x) and least <= x <= most and x == x // 1,
-        f"be a whole number from {least} to {most}",
-        reason,
-    )
+    must = f"be a whole number from {least} to {most}"
+    return rule(lambda x: is_number(x) and least <= x <= most and x == x // 1, must, reason)
 
 
 def not_negative(reason: str = "it is a size") -> Rule:

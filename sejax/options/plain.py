@@ -10,7 +10,7 @@ import functools
 import os
 import re
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -19,6 +19,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sejax.options import (
     ConfigError,
     as_text,
+    errors_of,
     is_number,
     listed,
     marks,
@@ -69,28 +70,24 @@ def from_plain(
         hints = typing.get_type_hints(cls)
     except NameError as error:
         raise ConfigError(
-            f"{where} must have fields of known types; {cls.__name__} raised {told(error)}. Import "
-            "that type where the class is defined.",
-            where,
+            f"{where} must have fields of known types: {told(error)}.", where
         ) from error
-    fields, read = fields_of(cls), {}
-    full = {name: f"{where}.{name}".lstrip(".") for name in fields}
+    defaults, fields = fields_of(cls), {}
+    full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     removed = getattr(cls, "removed", ())
     for name, value in values.items():
         if (name, value) in removed:
             continue
-        if name not in fields:
+        if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
         if marks(cls, name).get("names_code") and ":" in str(value):
             require_typed(full[name], str(value), imports)
-        read[name] = _read(value, hints[name], full[name], fields[name], imports)
-    for name, default in fields.items():
-        is_open = name in read or default is not MISSING
-        require(is_open, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
-    try:
-        return cls(**read)
-    except ConfigError as error:
-        raise error.moved(getattr(cls, "group", where), where) from None
+        fields[name] = _read(value, hints[name], full[name], defaults[name], imports)
+    for name, default in defaults.items():
+        is_known = name in fields or default is not MISSING
+        require(is_known, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
+    with errors_of(getattr(cls, "group", where), where):
+        return cls(**fields)
 
 
 def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
@@ -99,13 +96,9 @@ def require_typed(field: str, path: str, imports: Collection[str] | None) -> Non
     Raises:
       ConfigError: if it is not one of `imports`.
     """
-    require(
-        imports is None or path in imports,
-        field,
-        "must be typed on the command line if it is of a module of your own: what a file names is "
-        f"never imported; got {shortened(path, 60)}. Set {field}={shortened(path, 60)}, if you "
-        "trust it.",
-    )
+    got = shortened(path, 60)
+    message = f"must be typed, as what a file names is never imported; got {got}. Set {field}={got}"
+    require(imports is None or path in imports, field, f"{message}, if you trust it.")
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -127,36 +120,33 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
 
 def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
     """A value as its field's type, which pydantic converts; an error says what it must be."""
-    candidates: tuple[Any, ...] = (value,)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
-        is_read = isinstance(value, hint | Mapping)
-        require(is_read, name, f"must {fields}; got {shortened(repr(value))}. Leave it out.")
         if isinstance(value, hint):
             return value
+        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
+        message = f"must {fields}; got {shortened(repr(value))}. Leave it out."
+        require(isinstance(value, Mapping), name, message)
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name, imports)
-    item = next(iter(typing.get_args(hint)), None)
-    if dataclasses.is_dataclass(item) and isinstance(value, list | tuple):
-        return tuple(_read(each, item, name, MISSING, imports) for each in value)
+    candidates = [value]
     if isinstance(value, str):
-        text = expanded(value)
-        candidates = parsed(text), text
+        candidates = [parsed(expanded(value)), expanded(value)]
     elif is_number(value):  # or a name of digits, as of a folder
-        candidates = value, str(value)
+        candidates = [value, str(value)]
     must = "be no true or false"
     for candidate in candidates:
+        if candidate is None and default is None:
+            return None
         try:
-            read = _adapter(hint).validate_python(candidate)
+            converted = _adapter(hint).validate_python(candidate)
         except ValidationError as error:
             must = error.errors()[0]["msg"].removeprefix("Input should ").partition(", unable")[0]
-        else:
-            if isinstance(candidate, bool) == isinstance(read, bool):  # which are numbers in Python
-                return read
+        else:  # bools are numbers in Python
+            if isinstance(candidate, bool) == isinstance(converted, bool):
+                return converted
     is_open = default is MISSING or dataclasses.is_dataclass(default)
     fix = "VALUE" if is_open else as_text(to_plain(default))
-    got = shortened(repr(value))
-    raise ConfigError(f"{name} must {must}; got {got}. Set {name}={fix}.", name)
+    raise ConfigError(f"{name} must {must}; got {shortened(repr(value))}. Set {name}={fix}.", name)
 
 
 @functools.cache
@@ -201,28 +191,16 @@ def differences(
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
       'es.noise_std (0.1 there, 0.2 here)'
     """
-    found = [
-        f"{name} ({shortened(old, 60)} there, {shortened(new, 60)} here)"
-        for name, old, new in _differing(there, here)
-        if name.partition(".")[0] not in free
+    old, new = flatten(there), flatten(here)
+    names = sorted(name for name in old.keys() | new.keys() if name.partition(".")[0] not in free)
+    names = [x for x in names if repr(old.get(x)) != repr(new.get(x)) and old.get(x) != new.get(x)]
+    choices = {name.removesuffix(".name") for name in names if name.endswith(".name")}
+    names = [x for x in names if x.endswith(".name") or x.rpartition(".")[0] not in choices]
+    texts = [
+        f"{name} ({shortened(old.get(name), 60)} there, {shortened(new.get(name), 60)} here)"
+        for name in names[:most]
     ]
-    more = f" and {len(found) - most} more" if len(found) > most else ""
-    return ", ".join(found[:most]) + more
-
-
-def _differing(
-    there: Mapping[str, Any], here: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    for key in sorted(there.keys() | here.keys(), key=str):
-        old, new, name = there.get(key), here.get(key), f"{prefix}{key}"
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            yield from _differing(old, new, f"{name}.")
-        elif old != new and repr(old) != repr(new):  # by their texts nan is nan
-            yield name, _named(old), _named(new)
-
-
-def _named(value: Any) -> Any:
-    return value.get("name", "fields") if isinstance(value, Mapping) else value
+    return ", ".join(texts) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 # --- texts ---------------------------------------------------------------------------------------

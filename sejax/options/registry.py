@@ -25,6 +25,7 @@ A configuration is written as plain values (`describe`) and read back (`configur
 may be is in `sejax.options.plain`.
 """
 
+import copy
 import dataclasses
 import functools
 import importlib
@@ -33,15 +34,13 @@ import importlib.util
 import inspect
 import operator
 import re
-import typing
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sejax.options import (
     ConfigError,
     Options,
-    listed,
     nearest,
     place_of,
     require,
@@ -52,143 +51,103 @@ from sejax.options import (
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """A kind of plugin.
 
     Attributes:
       entry_points: group of entry points where packages offer more of it.
       makes: `module:attribute` of the class of what `make` returns.
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
-      built_in: name to `module:attribute`.
-      prefixes: beginning of a name to `module:attribute` of a dataclass with a field `name`.
       base: `module:attribute` of the class that each plugin's dataclass is a subclass of.
     """
 
     entry_points: str
     makes: str
     arguments: tuple[str, ...]
-    built_in: dict[str, str]
-    prefixes: dict[str, str] = dataclasses.field(default_factory=dict)
     base: str = "builtins:object"
 
 
-_EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
 GROUPS = {
-    "env": Group(
-        "sejax.envs",
-        "sejax.envs.base:Task",
-        (),
-        {
-            "cartpole": "sejax.envs.classic:CartPole",
-            "cartpole_v1": "sejax.envs.classic:CartPoleV1",
-            "acrobot": "sejax.envs.classic:Acrobot",
-            "cliff_walking": "sejax.envs.gridworld:CliffWalking",
-            "gridworld_2x2": "sejax.envs.gridworld:GridWorld2x2",
-            "mountain_car": "sejax.envs.classic:MountainCar",
-            "mountain_car_continuous": "sejax.envs.classic:MountainCarContinuous",
-            "pendulum": "sejax.envs.classic:Pendulum",
-            "halfcheetah": "sejax.envs.mujoco.tasks:HalfCheetah",
-            "hopper": "sejax.envs.mujoco.tasks:Hopper",
-            "walker2d": "sejax.envs.mujoco.tasks:Walker2d",
-            "swimmer": "sejax.envs.mujoco.tasks:Swimmer",
-            "inverted_pendulum": "sejax.envs.mujoco.tasks:InvertedPendulum",
-            "ant": "sejax.envs.mujoco.tasks:Ant",
-            "reacher": "sejax.envs.mujoco.tasks:Reacher",
-        },
-        {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"},
-    ),
+    "env": Group("sejax.envs", "sejax.envs.base:Task", ()),
     "agent": Group(
-        "sejax.agents",
-        "sejax.agents.base:Agent",
-        ("task",),
-        {
-            "ddqn": "sejax.agents.dqn:DDQNConfig",
-            "dueling_ddqn": "sejax.agents.dqn:DuelingDDQNConfig",
-            "dqn": "sejax.agents.dqn:DQNConfig",
-            "td3": "sejax.agents.td3:TD3Config",
-            "td3_discrete": "sejax.agents.td3:DiscreteTD3Config",
-            "ppo": "sejax.agents.ppo:PPOConfig",
-            "sac": "sejax.agents.sac:SACConfig",
-            "q_learning": "sejax.agents.tabular:QLearningConfig",
-            "sarsa": "sejax.agents.tabular:SARSAConfig",
-        },
-        base="sejax.agents.base:AgentConfig",
+        "sejax.agents", "sejax.agents.base:Agent", ("task",), "sejax.agents.base:AgentConfig"
     ),
     "exploration": Group(
         "sejax.explorations",
         "sejax.agents.base:Agent",
         ("agent", "task"),
-        {
-            "none": "sejax.agents.base:NoExploration",
-            "icm": "sejax.agents.exploration:ICMConfig",
-            "count_based": "sejax.agents.exploration:CountBasedConfig",
-        },
-        base="sejax.agents.base:ExplorationConfig",
+        "sejax.agents.base:ExplorationConfig",
     ),
     "proxy": Group(
-        "sejax.proxies",
-        "sejax.proxies.base:ProxyEnv",
-        ("task",),
-        {
-            "se": "sejax.proxies.synthetic:SyntheticConfig",
-            "rn": "sejax.proxies.reward:RewardConfig",
-        },
-        base="sejax.proxies:ProxyConfig",
+        "sejax.proxies", "sejax.proxies.base:ProxyEnv", ("task",), "sejax.proxies:ProxyConfig"
     ),
-    "objective": Group(
-        "sejax.objectives",
-        "sejax.objectives:Objective",
-        ("task",),
-        {
-            "max_reward": "sejax.objectives:MaxReward",
-            "reward_threshold": "sejax.objectives:RewardThreshold",
-            "auc": "sejax.objectives:AUC",
-            "auc_sum": "sejax.objectives:AUCSum",
-        },
-    ),
-    "es": Group(
-        "sejax.strategies",
-        "sejax.es.base:Strategy",
-        ("num_dims",),
-        {
-            "nes": "sejax.es.nes:NESConfig",
-            **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
-        },
-    ),
-    "tracker": Group(
-        "sejax.trackers",
-        "sejax.runs.trackers:Tracker",
-        ("run",),
-        {
-            "none": "sejax.runs.trackers:NoTracker",
-            "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
-            "wandb": "sejax.runs.trackers:WandbConfig",
-        },
-    ),
-    "machines": Group(
-        "sejax.machines",
-        "contextlib:AbstractContextManager",
-        ("config", "say"),
-        {
-            "local": "sejax.runs.workers:LocalConfig",
-            "ray": "sejax.runs.workers:RayConfig",
-        },
-    ),
+    "objective": Group("sejax.objectives", "sejax.objectives:Objective", ("task",)),
+    "es": Group("sejax.strategies", "sejax.es.base:Strategy", ("num_dims",)),
+    "tracker": Group("sejax.trackers", "sejax.runs.trackers:Tracker", ("run",)),
+    "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config", "say")),
 }
-
-
-_PATH = re.compile(r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])")
-
-
-def paths_in(words: Iterable[str]) -> list[str]:
-    """Each `module:attribute` in words.
-
-    Example:
-      >>> paths_in(["env=mine:Room", "agents=[ddqn,mine:A]", "proxy=hf://me/se", "storage=x://a:b@c"])
-      ['mine:Room', 'mine:A']
-    """
-    return [path for word in words for path in _PATH.findall(word)]
+_EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
+# Names that come with sejax.
+BUILT_IN = {
+    "env": {
+        "cartpole": "sejax.envs.classic:CartPole",
+        "cartpole_v1": "sejax.envs.classic:CartPoleV1",
+        "acrobot": "sejax.envs.classic:Acrobot",
+        "cliff_walking": "sejax.envs.gridworld:CliffWalking",
+        "gridworld_2x2": "sejax.envs.gridworld:GridWorld2x2",
+        "mountain_car": "sejax.envs.classic:MountainCar",
+        "mountain_car_continuous": "sejax.envs.classic:MountainCarContinuous",
+        "pendulum": "sejax.envs.classic:Pendulum",
+        "halfcheetah": "sejax.envs.mujoco.tasks:HalfCheetah",
+        "hopper": "sejax.envs.mujoco.tasks:Hopper",
+        "walker2d": "sejax.envs.mujoco.tasks:Walker2d",
+        "swimmer": "sejax.envs.mujoco.tasks:Swimmer",
+        "inverted_pendulum": "sejax.envs.mujoco.tasks:InvertedPendulum",
+        "ant": "sejax.envs.mujoco.tasks:Ant",
+        "reacher": "sejax.envs.mujoco.tasks:Reacher",
+    },
+    "agent": {
+        "ddqn": "sejax.agents.dqn:DDQNConfig",
+        "dueling_ddqn": "sejax.agents.dqn:DuelingDDQNConfig",
+        "dqn": "sejax.agents.dqn:DQNConfig",
+        "td3": "sejax.agents.td3:TD3Config",
+        "td3_discrete": "sejax.agents.td3:DiscreteTD3Config",
+        "ppo": "sejax.agents.ppo:PPOConfig",
+        "sac": "sejax.agents.sac:SACConfig",
+        "q_learning": "sejax.agents.tabular:QLearningConfig",
+        "sarsa": "sejax.agents.tabular:SARSAConfig",
+    },
+    "exploration": {
+        "none": "sejax.agents.base:NoExploration",
+        "icm": "sejax.agents.exploration:ICMConfig",
+        "count_based": "sejax.agents.exploration:CountBasedConfig",
+    },
+    "proxy": {
+        "se": "sejax.proxies.synthetic:SyntheticConfig",
+        "rn": "sejax.proxies.reward:RewardConfig",
+    },
+    "objective": {
+        "max_reward": "sejax.objectives:MaxReward",
+        "reward_threshold": "sejax.objectives:RewardThreshold",
+        "auc": "sejax.objectives:AUC",
+        "auc_sum": "sejax.objectives:AUCSum",
+    },
+    "es": {
+        "nes": "sejax.es.nes:NESConfig",
+        **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
+    },
+    "tracker": {
+        "none": "sejax.runs.trackers:NoTracker",
+        "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
+        "wandb": "sejax.runs.trackers:WandbConfig",
+    },
+    "machines": {
+        "local": "sejax.runs.workers:LocalConfig",
+        "ray": "sejax.runs.workers:RayConfig",
+    },
+}
+# Beginnings of a task's name: a dataclass with a field `name`.
+PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.stoa:StoaTask"}
 
 
 # --- names ---------------------------------------------------------------------------------------
@@ -196,12 +155,12 @@ def paths_in(words: Iterable[str]) -> list[str]:
 
 def names(group: str) -> list[str]:
     """The registered names: those that come with sejax, then those of installed packages."""
-    return [*GROUPS[group].built_in, *_offered(group)]
+    return [*BUILT_IN[group], *_offered(group)]
 
 
 def is_registered(group: str, name: str) -> bool:
     """Whether a name is known without importing a module that it names."""
-    return name in names(group) or _by_prefix(group, name) is not None
+    return _path_of(group, name) is not None
 
 
 def find(group: str, name: object, imports: Collection[str] | None = None) -> Any:
@@ -216,38 +175,68 @@ def find(group: str, name: object, imports: Collection[str] | None = None) -> An
       ConfigError: for an unknown name, a module that cannot or may not be imported, or an
         attribute that is no plugin.
     """
-    kind = GROUPS[group]
-    if not isinstance(name, str):
-        raise unknown_name(group, name, names(group))
-    built_in = kind.built_in.get(name) or _by_prefix(group, name)
-    if built_in is not None:
-        return _attribute(built_in)
-    if name in _offered(group):
-        return _as_dataclass(group, name, imported(group, _offered(group)[name]))
-    if ":" not in name:
-        is_path = "." in name and name.replace(".", "_").isidentifier()
-        meant = [":".join(name.rsplit(".", 1))] if is_path else []
-        raise unknown_name(group, name, [*names(group), *meant])
-    require_path(group, name)
-    require_typed(group, name, imports)
-    return _as_dataclass(group, name, imported(group, name))
+    text = name if isinstance(name, str) else ""
+    if text in BUILT_IN[group]:
+        return _attribute(BUILT_IN[group][text])
+    path = _path_of(group, text)
+    if path is None and ":" in text:
+        path = text
+        require_typed(group, path, imports)
+    if path is None:
+        raise unknown_name(group, name, [*names(group), *_meant(text)])
+    cls = _as_dataclass(group, text, imported(group, path))
+    if f"{cls.__module__}:{cls.__qualname__}" != text:
+        _NAMES[cls] = text
+    return cls
 
 
 def name_of(group: str, config: object) -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
-    own = f"{cls.__module__}:{cls.__qualname__}"
     if _is_one_of_many(cls):
         return str(config.name)  # type: ignore[attr-defined]
-    built_in = (name for name, path in GROUPS[group].built_in.items() if path == own)
-    return _NAMES.get(cls) or next(built_in, own)
+    path = f"{cls.__module__}:{cls.__qualname__}"
+    built_in = {path: name for name, path in BUILT_IN[group].items()}
+    return _NAMES.get(cls) or built_in.get(path, path)
 
 
-def configure(
-    group: str,
-    values: Mapping[str, Any],
-    imports: Collection[str] | None = None,
-) -> Any:
+def paths_in(words: Iterable[str]) -> list[str]:
+    """Each `module:attribute` in words.
+
+    Example:
+      >>> paths_in(["env=mine:Room", "agents=[ddqn,mine:A]", "proxy=hf://me/se", "storage=x://a:b@c"])
+      ['mine:Room', 'mine:A']
+    """
+    path = r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])"
+    return [found for word in words for found in re.findall(path, word)]
+
+
+_NAMES: dict[type, str] = {}  # of classes that were found by another name than their path
+
+
+@functools.cache
+def _offered(group: str) -> dict[str, str]:
+    """Entry points of installed packages; a name of sejax's own cannot be taken over."""
+    points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
+    return {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
+
+
+def _path_of(group: str, name: str) -> str | None:
+    """The `module:attribute` that a registered name stands for."""
+    prefixes = PREFIXES if group == "env" else {}
+    by_prefix = (path for start, path in prefixes.items() if name.startswith(start))
+    return (BUILT_IN[group] | _offered(group)).get(name) or next(by_prefix, None)
+
+
+def _is_one_of_many(cls: type) -> bool:
+    """Whether a class has a family of names, so that the name is one of its fields."""
+    return dataclasses.is_dataclass(cls) and "name" in fields_of(cls)
+
+
+# --- configurations ------------------------------------------------------------------------------
+
+
+def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | None = None) -> Any:
     """The configuration that plain values describe: the field `name`, and those of the plugin.
 
     Args:
@@ -262,34 +251,22 @@ def configure(
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
       0.9
     """
-    require(
-        isinstance(values, Mapping) and "name" in values,
-        group,
-        f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME.",
-    )
+    is_choice = isinstance(values, Mapping) and "name" in values
+    message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
+    require(is_choice, group, message)
     cls = find(group, values["name"], imports)
     fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
-    try:
-        return from_plain(cls, fields, group, imports)
-    except ConfigError as error:
-        raise _of_another(group, error) or error from None
-
-
-def _of_another(group: str, error: ConfigError) -> ConfigError | None:
-    """The error of a field that this choice has not, but another one that comes with sejax."""
-    field = error.field.removeprefix(f"{group}.")
-    others = [x for x in GROUPS[group].built_in if field in fields_of(find(group, x))]
-    if not others or "is no field" not in str(error):
-        return None
-    return ConfigError(f"{error.field} is a field of {group}={others[0]}. Set that.", error.field)
+    known = fields_of(cls)
+    for field in [name for name in fields if name not in known]:
+        others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
+        message = f"is a field of {group}={', '.join(others)}. Set one of them."
+        require(not others, f"{group}.{field}", message)
+    return from_plain(cls, fields, group, imports)
 
 
 def describe(group: str, config: object) -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
-
-
-# --- objects -------------------------------------------------------------------------------------
 
 
 def make(group: str, config: Any, *arguments: Any) -> Any:
@@ -302,16 +279,16 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
     key = (group, config if is_hashable(config) else id(config), *arguments)
-    if key not in _MADE:
-        made, kind = config.make(*arguments), _attribute(GROUPS[group].makes)
-        require(
-            isinstance(made, kind),
-            group,
-            f"must make a sejax.{kind.__name__}; got {type(made).__name__} from "
-            f"{shortened(name_of(group, config))}. Set {group} to a plugin that returns one.",
-        )
-        _MADE[key] = config, made  # with config, its id stays its own
-    return _MADE[key][1]
+    if key not in _PARTS:
+        part, cls = config.make(*arguments), _attribute(GROUPS[group].makes)
+        name = shortened(name_of(group, config))
+        message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
+        require(isinstance(part, cls), group, message)
+        _PARTS[key] = config, part  # with config, its id stays its own
+    return _PARTS[key][1]
+
+
+_PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
 
 def is_hashable(config: object) -> bool:
@@ -330,41 +307,17 @@ def require_package(group: str, config: Any) -> None:
       ConfigError: if it is not.
     """
     package, name = getattr(config, "package", None), name_of(group, config)
-    require(
-        package is None or importlib.util.find_spec(package) is not None,
-        group,
-        f"must be one that is installed; got {name} without the package {package}. Install it with "
-        f"pip install 'sejax[{name}]', or set {group}={next(iter(GROUPS[group].built_in))}.",
-    )
+    is_there = package is None or importlib.util.find_spec(package) is not None
+    message = f"must be installed; got {name} without the package {package}. Install it with pip"
+    require(is_there, group, f"{message} install 'sejax[{name}]'.")
 
 
-_MADE: dict[tuple[Any, ...], tuple[Any, Any]] = {}
-_NAMES: dict[type, str] = {}  # of classes that were found by another name than their own
-
-
-# --- plugins of others ---------------------------------------------------------------------------
-
-
-def _by_prefix(group: str, name: str) -> str | None:
-    prefixes = GROUPS[group].prefixes.items()
-    return next((path for start, path in prefixes if name.startswith(start)), None)
-
-
-def _is_one_of_many(cls: type) -> bool:
-    """Whether a class has a family of names, so that the name is one of its fields."""
-    return dataclasses.is_dataclass(cls) and "name" in {x.name for x in dataclasses.fields(cls)}
-
-
-@functools.cache
-def _offered(group: str) -> dict[str, str]:
-    """Entry points of installed packages; a name of sejax's own cannot be taken over."""
-    points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
-    return {x.name: x.value for x in points if x.name not in GROUPS[group].built_in}
+# --- plugins -------------------------------------------------------------------------------------
 
 
 def _attribute(path: str) -> Any:
     module, _, attribute = path.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    return operator.attrgetter(attribute)(importlib.import_module(module))
 
 
 def require_path(field: str, path: str) -> None:
@@ -374,119 +327,85 @@ def require_path(field: str, path: str) -> None:
       ConfigError: if it is not.
     """
     module, _, attribute = path.partition(":")
-    parts = [*module.split("."), *attribute.split(".")]
-    own = module.removesuffix(".py").replace("/", ".").strip(".")
-    fix = f"{own}:{attribute}" if own.replace(".", "_").isidentifier() else "my_module:MyClass"
-    require(
-        all(map(str.isidentifier, parts)) and not module.endswith(".py"),
-        field,
-        f"must be a name or module:attribute; got {shortened(path, 60)}. Set "
-        f"{field}={shortened(fix, 60)}.",
-    )
+    is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
+    got, fix = (shortened(x, 60) for x in (path, *_meant(path), "my_module:MyClass")[:2])
+    message = f"must be a name or module:attribute; got {got}. Set {field}={fix}."
+    require(is_path and not module.endswith(".py"), field, message)
+
+
+def _meant(text: str) -> list[str]:
+    """The `module:attribute` that a dotted name or the path of a file may stand for."""
+    match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
+    return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []
 
 
 def imported(field: str, path: str) -> Any:
     """What `module:attribute` names, which is imported.
 
     Raises:
-      ConfigError: if the module cannot be imported, or has nothing of this name.
+      ConfigError: if it is not of this form, the module cannot be imported, or has nothing of this
+        name.
     """
+    require_path(field, path)
     module, _, attribute = path.partition(":")
     try:
-        found = importlib.import_module(module)
+        return _attribute(path)
     except Exception as error:
-        fix = "" if place_of(error) else " Is its folder in PYTHONPATH?"
-        raise ConfigError(
-            f"{field} must name a module that can be imported; {shortened(path, 40)} raised "
-            f"{told(error)}.{fix}",
-            field,
-        ) from error
-    try:
-        return operator.attrgetter(attribute)(found)
-    except AttributeError as error:
-        known = [(k, x) for k, x in vars(found).items() if inspect.isfunction(x) or _makes(x)]
-        own = [k for k, x in known if x.__module__ == module]
-        near = nearest(attribute, own)
-        fix = f" Did you mean {field}={module}:{near[0]}?" if near else ""
-        raise ConfigError(
-            f"{field} must name a class or function of {shortened(module, 40)}; got "
-            f"{shortened(attribute, 40)}. There are: {listed(near, 60)}.{fix}",
-            field,
-        ) from error
+        members = vars(sys.modules.get(module, object)).items()
+        plugins = {name: x for name, x in members if _makes(x) or inspect.isfunction(x)}
+        known = [name for name, x in plugins.items() if x.__module__ == module]
+        hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
+        if known:
+            hint = f" Did you mean {field}={module}:{nearest(attribute, known)[0]}?"
+        got = shortened(path, 60)
+        message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
+        raise ConfigError(message, field) from error
 
 
-def _makes(found: object) -> bool:
+def _makes(plugin: object) -> bool:
     """Whether it is a dataclass with `make`."""
-    return isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make")
+    return isinstance(plugin, type) and hasattr(plugin, "make") and dataclasses.is_dataclass(plugin)
 
 
-def _as_dataclass(group: str, name: str, found: Any) -> Any:
+def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
-    arguments = GROUPS[group].arguments
-    if _makes(found):
-        cls: Any = found
-    else:
-        require(
-            inspect.isfunction(found) or isinstance(found, functools.partial),
-            group,
-            f"must name a dataclass with make({', '.join(arguments)}), or a function; got "
-            f"{shortened(name)}, which is {shortened(found)}. See docs/howto/own_pieces.md.",
-        )
-        cls = _from_function(group, name, found)
-    base = _attribute(GROUPS[group].base)
-    require(
-        issubclass(cls, base),
-        group,
-        f"must be a subclass of {base.__module__}.{base.__name__}; got {shortened(name)}. Set "
-        f"class {cls.__name__}({base.__name__}).",
-    )
-    if f"{cls.__module__}:{cls.__qualname__}" != name:
-        _NAMES[cls] = name
-    return cls
+    base, arguments = _attribute(GROUPS[group].base), GROUPS[group].arguments
+    if inspect.isfunction(plugin) or isinstance(plugin, functools.partial):
+        return _from_function(group, name, plugin)
+    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
+    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
+    require(_makes(plugin) and issubclass(plugin, base), group, f"{must} {shortened(plugin)}.")
+    return plugin
 
 
 @functools.cache
 def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass whose fields are a function's parameters beyond those that `make` is given."""
-    written: Any = getattr(function, "func", function)  # of a partial, what it is one of
-    arguments = GROUPS[group].arguments
-    parameters = list(inspect.signature(function).parameters.values())
+    arguments, signature = GROUPS[group].arguments, inspect.signature(function)
+    parameters = list(signature.parameters.values())
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
-    require(
-        len(parameters) >= len(arguments) and not is_open,
-        group,
-        f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got "
-        f"{shortened(f'{name}{inspect.signature(function)}')}. Set {group} to such a function.",
-    )
+    must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got"
+    is_fit = len(parameters) >= len(arguments) and not is_open
+    require(is_fit, group, f"{must} {shortened(f'{name}{signature}')}.")
     options = parameters[len(arguments) :]
-    lists = {p.name for p in options if isinstance(p.default, list)}
 
     def make(self: object, *given: object) -> Any:
-        values = {p.name: getattr(self, p.name) for p in options}
-        return function(*given, **{k: list(v) if k in lists else v for k, v in values.items()})
+        return function(*given, **{p.name: getattr(self, p.name) for p in options})
 
+    fields = []
+    for p in options:
+        hint = Any if p.annotation is p.empty else p.annotation
+        default = {"default": p.default}
+        if not is_hashable(p.default):  # such as a list
+            default = {"default_factory": functools.partial(copy.copy, p.default)}
+        fields.append(
+            (p.name, hint, dataclasses.field(**({} if p.default is p.empty else default)))
+        )
+    written: Any = getattr(function, "func", function)  # of a partial, what it is one of
     base = _attribute(GROUPS[group].base)
-    cls = dataclasses.make_dataclass(
-        written.__name__,
-        [_as_field(parameter) for parameter in options],
-        bases=(base if issubclass(base, Options) else Options,),
-        namespace={"make": make, "__doc__": written.__doc__},
-        frozen=True,
-        kw_only=True,
+    bases = (base if issubclass(base, Options) else Options,)
+    namespace = {"make": make, "__doc__": written.__doc__, "__module__": written.__module__}
+    kinds = {"frozen": True, "kw_only": True}
+    return dataclasses.make_dataclass(
+        written.__name__, fields, bases=bases, namespace=namespace, **kinds
     )
-    cls.__module__ = written.__module__
-    return cls
-
-
-def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
-    """A parameter as name, type and field of a dataclass."""
-    default, empty = parameter.default, inspect.Parameter.empty
-    kind = Any if parameter.annotation is empty else parameter.annotation
-    if default is empty:
-        return parameter.name, kind, dataclasses.field()
-    if default is None:  # which `length: float = None` may be too
-        kind = typing.Optional[kind]  # noqa: UP045 (it may be a string)
-    if isinstance(default, list):  # a tuple is hashable, so that what it configures is built once
-        default = tuple(default)
-        kind = tuple[(*typing.get_args(kind), Any)[0], ...]  # type: ignore[misc]
-    return parameter.name, kind, dataclasses.field(default=default)

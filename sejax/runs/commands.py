@@ -8,19 +8,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from sejax.options import (
-    ConfigError,
-    FailedError,
-    place_of,
-    require,
-    shortened,
-    told,
-)
-from sejax.runs import compose, runtime
+import yaml
+
+from sejax.options import ConfigError, FailedError, place_of, told
+from sejax.runs import runtime
+from sejax.runs.config import CommandConfig, plain
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -29,25 +25,26 @@ HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
 def start(
     main: Callable[[Sequence[str]], object],
     help_text: Callable[[Sequence[str]], str],
-    config_text: Callable[[Sequence[str]], str] | None = None,
+    configs_of: Callable[[Sequence[str]], Iterable[CommandConfig]] | None = None,
 ) -> None:
     """Runs a command on the words of the command line; errors become a message and an exit code.
 
     Args:
       main: the command, a function of its overrides.
       help_text: what `--help` prints beside these overrides.
-      config_text: what `--print-config` prints, if the command has this option.
+      configs_of: the configurations that `--print-config` prints, if the command has this option.
     """
     words = sys.argv[1:]
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
     with messages():
-        options = [*HELP, *([PRINT_CONFIG] if config_text else [])]
-        overrides = _prepared(words, options)
+        options = [*HELP, *([PRINT_CONFIG] if configs_of else [])]
+        overrides = [word for word in words if word not in options]
+        _prepare(overrides)
         if {*HELP} & {*words}:
             print(help_text(overrides))
-        elif config_text and PRINT_CONFIG in words:
-            print(config_text(overrides), end="")
+        elif configs_of and PRINT_CONFIG in words:
+            print(yaml.safe_dump_all(map(plain, configs_of(overrides)), sort_keys=False), end="")
         else:
             main(overrides)
 
@@ -61,28 +58,15 @@ def _stop(number: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt(128 + number)
 
 
-def _prepared(words: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Sets the process up, and returns the overrides among the words.
-
-    Raises:
-      ConfigError: for an option that is none.
-    """
+def _prepare(overrides: Sequence[str]) -> None:
+    """Sets the process up."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
-    for i, word in enumerate(words):
-        require(
-            not word.startswith("-") or word in known,
-            "an override",
-            f"must read FIELD=VALUE; got {shortened(word)}. Write {compose.meant(words[i:])}, "
-            f"without dashes. Options: {', '.join(known)}.",
-        )
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")
     Path.cwd()
-    overrides = [word for word in words if not word.startswith("-")]
     runtime.configure_xla(_devices(overrides))  # before a plugin starts jax's devices
-    return overrides
 
 
 def _devices(overrides: Sequence[str]) -> int | None:
@@ -90,8 +74,8 @@ def _devices(overrides: Sequence[str]) -> int | None:
     values = dict(override.partition("=")[::2] for override in overrides)
     if values.get("machines", "local") != "local":
         return 1
-    asked = values.get("devices", "")
-    return int(asked) if re.fullmatch(r"[1-9]\d{0,3}", asked) else None  # else it is refused later
+    count = values.get("devices", "")
+    return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None  # else it is refused later
 
 
 @contextlib.contextmanager

@@ -6,20 +6,25 @@ value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from sejax import agents, envs
-from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
+from sejax.agents.base import AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
     Options,
+    between,
     counts,
+    errors_of,
+    field_lines,
+    help_texts,
     one_of,
     option,
     registry,
@@ -27,19 +32,17 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import fields_of, flatten, from_plain, to_plain, unknown_field
-from sejax.proxies import header
-from sejax.runs.compose import (
-    DEFAULTS,
-    Share,
-    agents_of,
-    compose,
-    errors_of,
-    field_of,
-    key_of,
-    list_fields,
-    read,
+from sejax.options.plain import (
+    fields_of,
+    flatten,
+    from_plain,
+    merge,
+    to_plain,
+    unknown_field,
 )
+from sejax.proxies import ProxyConfig, header
+from sejax.runs import preset_files
+from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, read
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -47,12 +50,27 @@ EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
+# Fields that the default run directory is named by.
+IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
 JOINT = "+"  # between several agents, in names
 FIX = "Set agents=[ddqn,ppo]."
 Schema = TypeVar("Schema", bound="CommandConfig")
 
 
 # --- configurations ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share(Options):
+    """An agent's part in a mixture: `agents.KEY.weight`.
+
+    Attributes:
+      weight: share of the candidates that train it; with 0 it only judges incumbents
+    """
+
+    group: ClassVar[str] = "share"
+
+    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,26 +104,6 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
-    def field_of(self, key: str) -> str:
-        """The name of an agent's fields in words and messages."""
-        return field_of(key, self.agents)
-
-    def sections(self) -> Iterator[tuple[str, str, Any]]:
-        """Each dataclass that has fields: their prefixes in words and in files, and itself."""
-        yield "", "", self
-        for key, agent in self.agents.items():
-            yield self.field_of(key), f"agents.{key}", agent
-        for name, value in vars(self).items():
-            if dataclasses.is_dataclass(value) and name != "mixture":
-                yield name, name, value
-
-    @staticmethod
-    def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:
-        """The task of words, whose default agent is taken."""
-        fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
-        name = given.get("env", DEFAULTS["env"])
-        return envs.spec_of(registry.configure("env", {**fields, "name": name}, imports))
-
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
@@ -134,10 +132,6 @@ class LearnConfig(CommandConfig):
 
     groups: ClassVar[tuple[str, ...]] = tuple(DEFAULTS)
     learns: ClassVar[bool] = True
-    # Fields that the default run directory is named by.
-    in_run_dir: ClassVar[tuple[str, ...]] = (
-        *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
-    )
 
     weights: tuple[float, ...] = option(())
     mixture: MixtureConfig = option(MixtureConfig())
@@ -155,53 +149,32 @@ class LearnConfig(CommandConfig):
     checkpoint_every: int = option(1, counts("it counts generations"))
     run_dir: str | None = None
 
-    def sections(self) -> Iterator[tuple[str, str, Any]]:
-        yield from super().sections()
-        if len(self.agents) > 1:
-            yield "agents", "agents", self.mixture
-            for key, weight in zip(self.agents, self.weights, strict=True):
-                yield self.field_of(key), f"agents.{key}", Share(weight=weight)
-
     def __post_init__(self) -> None:
         super().__post_init__()
         seed()("seed + num_seeds - 1", self.seed + self.num_seeds - 1, 0)
         registry.require_package("tracker", self.tracker)
         registry.require_package("machines", self.machines)
-        require(
-            self.devices is None or not getattr(self.machines, "is_elsewhere", False),
-            "devices",
-            f"must be left out with trainings on other machines; got {self.devices}. Set "
-            "machines.workers=N in its place, or machines=local.",
+        is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
+        message = (
+            f"must be left out with other machines; got {self.devices}. Set machines.workers=N."
         )
-        require_real_returns("training", self.training)
-        require(
-            not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True),
-            "stop_when_solved",
-            "must be false with an objective whose scores are not returns; got true with "
-            f"objective={self.name('objective')}. Set stop_when_solved=false.",
-        )
+        require(is_here, "devices", message)
+        is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
+        message = f"must be false with objective={self.name('objective')}, whose scores are no"
+        require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
-        max_steps = self.proxy.max_steps(spec.max_steps)
         if not self.proxy.has_real_dynamics:
-            require_reachable("training", self.training, max_steps)
-        for key, agent in self.agents.items():
-            with errors_of("agent", self.field_of(key)):
-                agents.require_fit(agent, self.exploration, spec, task_name)
-                if self.proxy.reaches_step_limit:
-                    limits = max_steps, spec.max_steps
-                    require_learning("training", self.training, agent, *limits)
+            require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
+        for key in self.agents:
+            require_fit(self, key, spec, task_name)
+            require_learning(self, key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
         if group == "agent":
             return JOINT.join(self.agents)
         return registry.name_of(group, getattr(self, group))
-
-    @property
-    def scored_agents(self) -> tuple[str, ...]:
-        """The agents that have scores of their own."""
-        return tuple(self.agents)
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -213,10 +186,16 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The objects that it describes, as `sejax.make_learner` takes them."""
-        task = self.task()
+        task, is_varied = self.task(), self.agent_hparams == "varied"
+        learners = tuple(
+            agents.make_agent(agent, task, self.exploration, is_varied)
+            for agent in self.agents.values()
+        )
+        names, weights = tuple(self.agents), self.weights
+        several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
             "task": task,
-            "agent": self._learners(task),
+            "agent": several if len(learners) > 1 else learners[0],
             "proxy": registry.make("proxy", self.proxy, task),
             "es": self.es,
             "objective": registry.make("objective", self.objective, task),
@@ -226,27 +205,14 @@ class LearnConfig(CommandConfig):
             "num_parallel": self.num_parallel,
         }
 
-    def _learners(self, task: envs.Task) -> Agent | Mixture:
-        """The agent, or the mixture of agents, that trains on the proxies."""
-        is_varied = self.agent_hparams == "varied"
-        learners = tuple(
-            agents.make_agent(agent, task, self.exploration, is_varied)
-            for agent in self.agents.values()
-        )
-        if len(learners) == 1:
-            return learners[0]
-        names = tuple(self.agents)
-        return Mixture(agents=learners, names=names, weights=self.weights, config=self.mixture)
-
     @property
     def resolved_run_dir(self) -> Path:
-        """The run directory: by default named by `in_run_dir`."""
-        explored = self.name("exploration")
-        explored = "" if explored == "none" else f"_{explored}"
-        varied = "_varied" if self.agent_hparams == "varied" else ""
-        agent = f"{self.name('agent')}{explored}{varied}"
-        name = f"{self.name('env')}-{self.name('proxy')}-{agent}-s{self.seed}"
-        return Path(self.run_dir or Path("runs", as_file_name(name)))
+        """The run directory; by default it is named by `IN_RUN_DIR`."""
+        name = "-".join(map(self.name, ("env", "proxy", "agent")))
+        explored, varied = self.name("exploration"), self.agent_hparams
+        name += f"_{explored}" if explored != "none" else ""
+        name += f"_{varied}" if varied != "default" else ""
+        return Path(self.run_dir or Path("runs", as_file_name(f"{name}-s{self.seed}")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,34 +245,69 @@ class EvaluateConfig(CommandConfig):
     out_dir: str | None = None
     real_training: TrainingConfig = REAL_TRAINING
 
-    @staticmethod
-    def spec_for(given: Mapping[str, Any], imports: Collection[str] | None = None) -> TaskSpec:
-        """The task of a stored proxy, or of words; nothing that a file names is imported."""
-        source = str(given.get("proxy", "real"))
-        if source == "real":
-            return CommandConfig.spec_for(given, imports)
-        return header.read(source, "proxy").header.spec
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, idle, default in (
-            ("agent_hparams", "as_learned", "default"),
-            ("training_from", "config", "proxy"),
-        ):
-            require(
-                self.proxy != "real" or getattr(self, name) != idle,
-                name,
-                f"must be {default} with proxy=real; got {idle}. Set {name}={default}.",
-            )
-        own, default = to_plain(self.training).items(), to_plain(TRAINING)
-        changed = ", ".join(f"{k}={v}" for k, v in own if v != default[k])
-        instead = "" if self.proxy == "real" else "training_from=config, or "
-        require(
-            self.training_from == "config" or not changed,
-            "training",
-            "must be left as it is: agents train on an SE as it was learned with, else as "
-            f"real_training says; got {shortened(changed)}. Set {instead}real_training.*.",
+        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
+            is_idle = self.proxy == "real" and getattr(self, name) == idle
+            require(not is_idle, name, f"must be left out with proxy=real; got {idle}.")
+        default, training = to_plain(TRAINING), to_plain(self.training).items()
+        changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
+        fix = "" if self.proxy == "real" else "training_from=config, or "
+        message = (
+            f"must be left out, as it says nothing here; got {changed}. Set {fix}real_training.*."
         )
+        require(self.training_from == "config" or not changed, "training", message)
+
+
+# --- what must hold of an agent -------------------------------------------------------------------
+
+
+def require_fit(config: CommandConfig, key: str, spec: TaskSpec, task_name: str) -> None:
+    """Checks that one of a configuration's agents can act in a task.
+
+    Raises:
+      ConfigError: if it cannot.
+    """
+    with errors_of("agent", field_of(key, config.agents)):
+        agents.require_fit(config.agents[key], config.exploration, spec, task_name)
+
+
+def require_learning(
+    config: CommandConfig,
+    key: str,
+    group: str,
+    training: TrainingConfig,
+    proxy: ProxyConfig,
+    spec: TaskSpec,
+) -> None:
+    """Checks that an agent learns something on a proxy.
+
+    Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a step
+    budget must let it learn. What stops it must not read the proxy's returns.
+
+    Args:
+      config: of the command.
+      key: of the agent.
+      group: of the fields of its training.
+      training: how long it trains.
+      proxy: the proxy's configuration.
+      spec: of the real task.
+
+    Raises:
+      ConfigError: if it does not.
+    """
+    field, got = f"{group}.solved_by", training.solved_by
+    message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
+    require(training.stop_rule != "solved" or got == "test", field, message)
+    field, steps = f"{group}.max_steps", training.max_steps
+    limits = proxy.max_steps(spec.max_steps), spec.max_steps
+    before = config.agents[key].steps_before_learning(*limits)
+    message = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
+    is_enough = not proxy.reaches_step_limit or steps is None or steps > before
+    require(is_enough, field, f"{message} Set {field}={4 * before}.")
+
+
+# --- plain values ---------------------------------------------------------------------------------
 
 
 def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()) -> LearnConfig:
@@ -338,15 +339,6 @@ def plain(config: CommandConfig) -> dict[str, Any]:
     return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
 
 
-def words_of(config: CommandConfig) -> dict[str, Any]:
-    """The value of each field, by its name in words; that of a choice is its name."""
-    values = plain(config)
-    if len(config.agents) == 1:
-        values["agent"] = values.pop("agents").popitem()[1]
-    values = flatten(values)
-    return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
-
-
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
@@ -362,75 +354,39 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
 def _from_plain(
     schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
 ) -> Schema:
-    objects = dict(values)
+    objects, fields = dict(values), fields_of(schema)
     one, several = objects.pop("agent", None), objects.pop("agents", None) or {}
     if one is not None:  # as an older file has it
         several = {key_of(str(dict(one).get("name"))): one, **several}
-    is_map = isinstance(several, Mapping) and bool(several)
-    require(is_map, "agents", f"must be agents by their keys; got {shortened(several)}. {FIX}")
+    is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
+    got = shortened(several)
+    require(
+        is_map and several, "agents", f"must be agents by keys that are words; got {got}. {FIX}"
+    )
     of_mixture = fields_of(MixtureConfig) if schema.learns else ()
     shared = {name: several[name] for name in of_mixture if name in several}
-    of_agents = {str(key): x for key, x in several.items() if key not in shared}
-    objects["agents"], weights = {}, []
-    for key, fields in sorted(of_agents.items()):
-        require(key == key_of(key), "agents", f"must be words; got {shortened(key)}. {FIX}")
-        where, fields = field_of(key, of_agents), fields if isinstance(fields, Mapping) else {}
-        share = {k: x for k, x in fields.items() if k == "weight" and schema.learns}
+    keys, weights = sorted(several.keys() - shared.keys()), []
+    objects["agents"] = {}
+    for key in keys:
+        where, agent = field_of(shortened(key, 40), keys), several[key]
+        agent = dict(agent) if isinstance(agent, Mapping) else {}
+        is_shared = schema.learns and "weight" in agent
+        share = {"weight": agent.pop("weight")} if is_shared else {}
         weights.append(from_plain(Share, share, where).weight)
         with errors_of("agent", where):
-            own = {k: x for k, x in fields.items() if k not in share}
-            objects["agents"][key] = registry.configure("agent", own, imports)
+            objects["agents"][key] = registry.configure("agent", agent, imports)
     if schema.learns:
         mixture = from_plain(MixtureConfig, shared, "agents")
-        objects |= {"weights": weights, "mixture": mixture}
         is_idle = mixture == MixtureConfig() and {*weights} == {1.0}
         field = f"agents.{next(iter(shared), 'KEY.weight')}"
         require(len(weights) > 1 or is_idle, field, f"must come with several agents. {FIX}")
+        objects |= {"weights": weights, "mixture": mixture}
     for group in schema.groups:
         objects[group] = registry.configure(group, objects.get(group, {}), imports)
-    fields = fields_of(schema)
-    for name in objects.keys() - fields.keys():
-        parts = {k: x for k, x in objects.items() if k in fields and k != "agents"}
-        parts |= {field_of(key, of_agents): x for key, x in objects["agents"].items()}
-        raise unknown_field(str(name), [*fields, *flatten(to_plain(parts))])
-    return from_plain(schema, objects, "", imports)
-
-
-def require_real_returns(name: str, training: TrainingConfig) -> None:
-    """Checks that the rule by which agents stop on a proxy does not read the proxy's returns.
-
-    Raises:
-      ConfigError: if it does.
-    """
-    require(
-        training.stop_rule != "solved" or training.solved_by == "test",
-        f"{name}.solved_by",
-        "must be test with stop_rule=solved, as returns on a proxy say nothing of the threshold; "
-        f"got {training.solved_by}. Set {name}.solved_by=test.",
-    )
-
-
-def require_learning(
-    name: str,
-    training: TrainingConfig,
-    agent: AgentConfig,
-    max_episode_steps: int,
-    task_max_steps: int,
-) -> None:
-    """Checks that a step budget lets an agent learn in a world whose episodes last to their limit.
-
-    One-step SEs are such, and most with soft ends, which may never end an episode.
-
-    Raises:
-      ConfigError: if it does not.
-    """
-    before = agent.steps_before_learning(max_episode_steps, task_max_steps)
-    require(
-        training.max_steps is None or training.max_steps > before,
-        f"{name}.max_steps",
-        f"must exceed {before}, before which {shortened(registry.name_of('agent', agent))} learns "
-        f"nothing; got {training.max_steps}. Set {name}.max_steps={4 * before}.",
-    )
+    config = from_plain(schema, {k: x for k, x in objects.items() if k in fields}, "", imports)
+    for name in [name for name in objects if name not in fields]:
+        raise unknown_field(str(name), words_of(config))
+    return config
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -449,70 +405,104 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    composed = compose(LearnConfig, overrides)
-    return _from_plain(LearnConfig, composed.values, composed.imports)
+    layers, imports = compose(LearnConfig, overrides)
+    return _from_plain(LearnConfig, merge(*layers.values()), imports)
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    composed = compose(EvaluateConfig, overrides, _learned(read(overrides)))
-    require(
-        "proxy" in composed.values,
-        "proxy",
-        "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
-        "proxy=real env=cartpole.",
-    )
-    return _from_plain(EvaluateConfig, composed.values, composed.imports)
+    layers, imports = compose(EvaluateConfig, overrides, _learned(read(overrides)))
+    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
+    require("proxy" in layers["typed"], "proxy", message)
+    return _from_plain(EvaluateConfig, merge(*layers.values()), imports)
 
 
 def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
-    """What `--help` says of a command's fields beside these words."""
-    stored = {} if schema.learns else _learned(read(overrides))
-    composed = compose(schema, overrides, stored)
-    values = {"proxy": "RUN_DIR", **composed.values}  # if an evaluation has none yet
-    config = _from_plain(schema, values, composed.imports)
-    return list_fields(config, composed.layers)
+    """What `--help` says of a command's fields beside these words.
+
+    The choices of each group, and the fields of these choices. A value that is no default has the
+    layer beside it that it comes from.
+    """
+    words = overrides if schema.learns else ["proxy=RUN_DIR", *overrides]
+    layers, imports = compose(schema, words, {} if schema.learns else _learned(read(words)))
+    config = _from_plain(schema, merge(*layers.values()), imports)
+    lines = ["Choices (group=choice):"]
+    for group in ("agent", *schema.groups):
+        prefixes = [f"{start}ID" for start in registry.PREFIXES] if group == "env" else []
+        known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
+        lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
+    lines += ["  agents: [agent,agent,...]"]
+    if schema.learns:
+        lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
+    lines += ["", "Fields of these choices (field=value), with their values:"]
+    classes = {name: type(x) for name, x in vars(config).items()}
+    classes |= {field_of(key, config.agents): type(x) for key, x in config.agents.items()}
+    classes |= {"": schema, "agents": MixtureConfig}
+    sources = dict[str, str]()
+    for layer, values in layers.items():
+        names = flatten(_as_words(values, config.agents))
+        sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
+    fields, texts = words_of(config), dict[str, str]()
+    choices = {name.removesuffix(".name") for name in fields if name.endswith(".name")}
+    fields = {k: x for k, x in fields.items() if k.removesuffix(".name") not in choices}
+    for name in fields:
+        group, _, field = name.rpartition(".")
+        of_group = help_texts(Share) | help_texts(classes.get(group, Share))
+        texts |= {name: of_group[field]} if field in of_group else {}
+    return "\n".join([*lines, field_lines(fields, texts, sources)])
+
+
+def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
+    """Plain values with an only agent's as `agent`, as words have them."""
+    several = values.get("agents", {})
+    rest = {name: x for name, x in values.items() if name != "agents"}
+    return rest | ({"agents": several} if len(agents) > 1 else {"agent": several.get(*agents, {})})
+
+
+def words_of(config: CommandConfig) -> dict[str, Any]:
+    """The value of each field, by its name in words; that of a choice is its name."""
+    values = flatten(_as_words(plain(config), config.agents))
+    return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
 
 
 def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     """What a proxy was learned with, as far as the agents of an evaluation have it.
 
-    Where its words name no agent, they are all of the proxy's, with their exploration. An agent
-    that they name has the hyperparameters that the proxy was learned with, if it was with such a
-    one.
+    Where its words name no agent, they are all of the proxy's, with their exploration; of a file
+    that does not tell its agents, the default one of its task. An agent that they name has the
+    hyperparameters that the proxy was learned with, if it was with such a one.
 
     Raises:
       ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
         tell its agents.
     """
     source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
-    if source == "real" or hparams not in (None, "as_learned"):
+    groups = "agent", "agents", "exploration"
+    words = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
+    if source == "real":
         return {}
-    groups = ("agent", "agents", *EvaluateConfig.groups)
-    own = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
-    require(
-        not own or hparams is None,
-        next(iter(own), "").partition(".")[0],
-        "must be left out with agent_hparams=as_learned; got "
-        f"{shortened(', '.join(f'{k}={x}' for k, x in own.items()))}. Set agent_hparams=default.",
+    field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
+    message = (
+        f"must be left out with agent_hparams=as_learned; got {got}. Set agent_hparams=default."
     )
-    none = {"name": "none"}
+    require(not words or hparams != "as_learned", field, message)
+    stored, learned = None, dict[str, Any]()
     try:
-        path = header.find(source, "proxy")
-        stored = header.read_config(path, "proxy")
-        learned = {
-            key_of(key): registry.describe("agent", header.configured("agent", x, path.name))
-            for key, x in header.agents_of(stored).items()
-        }
-        explored = header.configured("exploration", stored.get("exploration", none), path.name)
+        stored = header.read(source, "proxy").header
+        explored = stored.config.get("exploration", {"name": "none"})
+        header.configured("exploration", explored, source)
+        agents_there = header.agents_of(stored.config)
+        for agent in agents_there.values():
+            header.configured("agent", agent, source)
+        learned = {key_of(key): agent for key, agent in agents_there.items()}
     except ConfigError:  # of the proxy, which is said when it is loaded
         if hparams == "as_learned":
             raise
+    if stored is None:
         return {}
-    if not own:
-        explored = registry.describe("exploration", explored)
+    if learned and not words and hparams in (None, "as_learned"):
         return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
-    by_name = {values["name"]: values for values in learned.values()}
-    default = agents.default_for(EvaluateConfig.spec_for(given))
-    keys = agents_of(given) or {default: default}
-    return {"agents": {key: by_name.get(name, {"name": name}) for key, name in keys.items()}}
+    default = agents.default_for(stored.spec)
+    by_name = {x["name"]: x for x in learned.values()} if hparams is None else {}
+    names = agents_of(given) or {default: default}
+    return {"agents": {key: by_name.get(name, {"name": name}) for key, name in names.items()}}

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from sejax.options import ConfigError, listed, require, shortened, told, unknown_name
+from sejax.options import ConfigError, listed, shortened, told, unknown_name
 from sejax.options.plain import flatten, merge, parsed
 
 PRESETS = Path(__file__).parents[1] / "presets"
@@ -40,8 +40,7 @@ def _read_sections(path: Path, bases: Mapping[str, Any]) -> dict[str, dict[str, 
     sections: dict[str, dict[str, Any]] = {}
     for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
         like = section.pop("like", None)
-        base = {**bases, **sections}[like] if like else {}
-        sections[name] = merge(base, section)
+        sections[name] = merge({**bases, **sections}[like] if like else {}, section)
     return sections
 
 
@@ -58,8 +57,8 @@ def is_tuned(env: str, proxy: str) -> bool:
 def tuned(proxy: str, preset: str = "best") -> list[str]:
     """Tasks that have settings of their own for a proxy."""
     stems = sorted(stem for stem, sections in _all_sections().items() if preset in sections)
-    pairs = [stem.rpartition("-") for stem in stems]
-    return [env for env, _, of in pairs if of == proxy and env != GENERAL]
+    tasks = [stem.removesuffix(f"-{proxy}") for stem in stems if stem.endswith(f"-{proxy}")]
+    return [task for task in tasks if task != GENERAL]
 
 
 def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
@@ -74,17 +73,14 @@ def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
+    sections = sections_of(env, proxy)
+    if preset in sections:
+        return sections[preset]
     if preset not in names():
         raise unknown_name("preset", preset, names())
-    sections = sections_of(env, proxy)
-    require(
-        preset in sections,
-        "preset",
-        f"must be one that env={shortened(env)} has with proxy={shortened(proxy)} "
-        f"({listed(list(sections))}); got {preset}, which {listed(tuned(proxy, preset), 60)} have. "
-        "Set preset=best.",
-    )
-    return sections[preset]
+    there, tasks = listed(list(sections)), listed(tuned(proxy, preset), 60)
+    message = f"must be one that {shortened(env)} has ({there}); got {preset}, which {tasks} have."
+    raise ConfigError(f"preset {message} Set preset=best.", "preset")
 
 
 def settings_of(
@@ -103,10 +99,9 @@ def settings_of(
     layers = [{k: x for k, x in section.items() if not k.startswith("with_")}]
     layers += [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
     layers += settings.values() if len(agents) == 1 else []
-    shared = {k: x for k, x in merge(*layers).items() if k != "agent"}
-    objective = {k: x for k, x in shared.get("objective", {}).items() if k != "name"}  # chosen
-    of_agents = {key: each.get("agent", {}) for key, each in settings.items()}
-    return shared | {"objective": objective, "agents": of_agents}
+    shared = merge(*layers, {"objective": {"name": chosen["objective"]}})
+    shared["agents"] = {key: beside.get("agent", {}) for key, beside in settings.items()}
+    return {k: x for k, x in shared.items() if k != "agent"}
 
 
 def read_file(path: Path) -> dict[str, Any]:
@@ -116,26 +111,13 @@ def read_file(path: Path) -> dict[str, Any]:
       ConfigError: for a file that cannot be read, or that holds no fields.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        values = flatten(content) if isinstance(content, dict) else {}
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        values = flatten(dict(yaml.safe_load(path.read_text(encoding="utf-8"))))
+    except (OSError, ValueError, TypeError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError(
-            f"preset must be a name or a YAML file that can be read; got {shortened(path, 40)} "
-            f"({told(error)}). Set preset=best.",
+            f"preset must be a name, or a YAML file of fields; got "
+            f"{shortened(path, 40)} ({told(error)}). Set preset=best.",
             "preset",
         ) from error
-    require(
-        values,
-        "preset",
-        f"must be a file that maps fields to values; got {shortened(path)} with "
-        f"{shortened(content)}. Write `es.noise_std: 0.1` there, or set preset=best.",
-    )
-    base = str(values.get("preset", ""))
-    require(
-        not base.endswith(ENDING),
-        "preset",
-        f"must name no file in a file; got {shortened(base)}. Write preset: best.",
-    )
     return {name: x for name, x in values.items() if x is not None or name not in NONE}
 
 

@@ -85,7 +85,7 @@ class RunProgress(_Line, Reporter):
         """Shows the numbers of a generation; steps per second are the session's so far."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
-        values, agents = info.values, self._config.scored_agents
+        values, agents = info.values, list(self._config.agents)
         means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents[1:] and agents)
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files

@@ -76,7 +76,7 @@ class RunDirectory(Store):
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
         self.versions: object = runtime.versions()
-        self._agents = config.scored_agents if len(config.scored_agents) > 1 else ()
+        self._agents = tuple(config.agents) if len(config.agents) > 1 else ()
         of_agents = [f"{name}_{agent}" for agent in self._agents for name in AGENT_COLUMNS]
         self.columns = (*COLUMNS, *of_agents)
         self._tensors: dict[str, np.ndarray] | None = None
