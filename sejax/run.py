@@ -20,7 +20,7 @@ from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
-from sejax.runs.run_directory import open_for
+from sejax.runs.run_directory import RunDirectory
 
 
 def main(overrides: Sequence[str]) -> None:

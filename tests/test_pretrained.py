@@ -9,7 +9,6 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import pandas as pd
 import pytest
 from plain_agents import agent_for, learn, mean_return
 from support import refused
@@ -94,25 +93,11 @@ def test_the_page_is_what_the_tool_makes():
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
 
 
-def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
-    """If it was tested, with the weights that are shipped: those of a bandit are a policy's."""
-    verdicts = make_zoo.verdicts()
-    for proxy in PROXIES.values():
-        cell = make_zoo.row(proxy, verdicts)["teaches by"]
-        assert (
-            cell == ""
-            or (proxy.kind == "se" and proxy.settings["horizon"] != 1)
-            or cell == "policy"
-        )
-    folder = tmp_path / "results" / "se_myopia" / "cartpole"
-    folder.mkdir(parents=True)
-    monkeypatch.setattr(make_zoo, "ROOT", tmp_path)
-    (folder / "table.md").write_text("| SEs | verdict |\n| cartpole (shipped) | 9 | dynamics |\n")
-    tested = {sejax.load_proxy("cartpole").fingerprint: {"cartpole": "dynamics"}, "another": {}}
-    for fingerprint, expected in tested.items():
-        rows = pd.DataFrame({"set": ["cartpole (shipped)", None], "group": [fingerprint, "x"]})
-        rows.to_csv(folder / "rows.csv.xz", index=False)
-        assert make_zoo.verdicts() == expected
+def test_the_page_says_which_algorithms_solve_the_task():
+    rows = {name: make_zoo.row(proxy) for name, proxy in PROXIES.items()}
+    assert rows["halfcheetah"]["solved by"] == "none"  # at most 1,646 of 3,000
+    assert rows["acrobot"]["not by"] == "td3_discrete"  # -128, where the others reach -85
+    assert rows["cliff_walking-rn"]["not by"] == ""
 
 
 def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):

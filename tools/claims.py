@@ -130,7 +130,13 @@ class Claims:
 
     def documents(self) -> dict[str, str]:
         """The text of each document, by its path."""
-        paths = sorted([*self.root.glob("*.md"), *self.root.glob("docs/**/*.md"), *self.root.glob("paper/*.md")])
+        paths = sorted(
+            [
+                *self.root.glob("*.md"),
+                *self.root.glob("docs/**/*.md"),
+                *self.root.glob("paper/*.md"),
+            ]
+        )
         texts = {str(x.relative_to(self.root)): x.read_text(encoding="utf-8") for x in paths}
         made = self.entries.get("generated", ())
         return {name: x for name, x in texts.items() if "_build" not in name and name not in made}

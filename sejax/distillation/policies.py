@@ -27,7 +27,17 @@ from jaxtyping import Array
 from sejax.agents import make_agent
 from sejax.distillation.policy_search import Lesson, random_map
 from sejax.envs.base import Task
-from sejax.options import ConfigError, Options, counts, option, registry, require, shortened, told
+from sejax.options import (
+    ConfigError,
+    Options,
+    counts,
+    errors_of,
+    option,
+    registry,
+    require,
+    shortened,
+    told,
+)
 from sejax.proxies.exact import Layer, evaluate, require_vectors
 from sejax.training import TrainingConfig, make_trainer
 
@@ -129,10 +139,8 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     """A fresh agent with its default hyperparameters, trained on the real task."""
-    try:
+    with errors_of("agent", "policy"):  # it may not fit the task
         agent = make_agent(registry.configure("agent", {"name": name}), task)
-    except ConfigError as error:  # it does not fit the task
-        raise error.moved("agent", "policy") from error
     training = TrainingConfig(
         max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
     )

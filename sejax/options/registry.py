@@ -147,7 +147,7 @@ BUILT_IN = {
     },
 }
 # Beginnings of a task's name: a dataclass with a field `name`.
-PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.stoa:StoaTask"}
+PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"}
 
 
 # --- names ---------------------------------------------------------------------------------------

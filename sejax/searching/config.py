@@ -140,7 +140,8 @@ def read(overrides: Sequence[str]) -> Search:
     default, fields = search.default, configuration.words_of(search.default)
     if config.space is not None:
         agents = {
-            default.field_of(k): registry.name_of("agent", x) for k, x in default.agents.items()
+            compose.field_of(k, default.agents): registry.name_of("agent", x)
+            for k, x in default.agents.items()
         }
         for name, dimension in spaces.preset(config.space, agents).items():
             if name not in others:
