@@ -254,7 +254,7 @@ def parsed(text: str) -> Any:
         return _CONSTANTS[text]
     if text[:1] == "[" and text[-1:] == "]":
         return [parsed(part) for part in split(text[1:-1])] if text[1:-1].strip() else []
-    for kind in (int, float):
+    for number in (int, float):
         with suppress(ValueError):
-            return kind(text)
+            return number(text)
     return unquoted(text)

@@ -208,7 +208,7 @@ def paths_in(words: Iterable[str]) -> list[str]:
       ['mine:Room', 'mine:A']
     """
     path = r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])"
-    return [found for word in words for found in re.findall(path, word)]
+    return [match for word in words for match in re.findall(path, word)]
 
 
 _NAMES: dict[type, str] = {}  # of classes that were found by another name than their path
@@ -389,8 +389,8 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     require(is_fit, group, f"{must} {shortened(f'{name}{signature}')}.")
     options = parameters[len(arguments) :]
 
-    def make(self: object, *given: object) -> Any:
-        return function(*given, **{p.name: getattr(self, p.name) for p in options})
+    def make(self: object, *parts: object) -> Any:
+        return function(*parts, **{p.name: getattr(self, p.name) for p in options})
 
     fields = []
     for p in options:
@@ -405,7 +405,6 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     base = _attribute(GROUPS[group].base)
     bases = (base if issubclass(base, Options) else Options,)
     namespace = {"make": make, "__doc__": written.__doc__, "__module__": written.__module__}
-    kinds = {"frozen": True, "kw_only": True}
-    return dataclasses.make_dataclass(
-        written.__name__, fields, bases=bases, namespace=namespace, **kinds
-    )
+    frozen = {"frozen": True, "kw_only": True}
+    name = written.__name__
+    return dataclasses.make_dataclass(name, fields, bases=bases, namespace=namespace, **frozen)

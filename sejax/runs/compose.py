@@ -138,9 +138,9 @@ def swept(
     for of_run in expand(overrides):
         config = make(of_run)
         folder = getattr(config, field)
-        told = known if folder is None else (field,)
+        named_by = known if folder is None else (field,)
         words = [word for word, values in zip(of_run, overrides, strict=True) if word != values]
-        name = as_file_name(",".join(x for x in words if x.partition("=")[0] not in told))
+        name = as_file_name(",".join(x for x in words if x.partition("=")[0] not in named_by))
         name = name if len(name) <= 120 else hashlib.sha256(name.encode()).hexdigest()[:16]
         if name:
             folder = folder_of(config, name) if folder is None else f"{folder}/{name}"

@@ -333,8 +333,8 @@ def plain(config: CommandConfig) -> dict[str, Any]:
     of_agents = {key: registry.describe("agent", x) for key, x in config.agents.items()}
     mixture, weights = values.pop("mixture", None), values.pop("weights", ())
     if len(of_agents) > 1 and mixture is not None:
-        for one, weight in zip(of_agents.values(), weights, strict=True):
-            one["weight"] = weight
+        for agent, weight in zip(of_agents.values(), weights, strict=True):
+            agent["weight"] = weight
         of_agents |= to_plain(mixture)
     return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
 
@@ -355,14 +355,12 @@ def _from_plain(
     schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
 ) -> Schema:
     objects, fields = dict(values), fields_of(schema)
-    one, several = objects.pop("agent", None), objects.pop("agents", None) or {}
-    if one is not None:  # as an older file has it
-        several = {key_of(str(dict(one).get("name"))): one, **several}
+    several, single = objects.pop("agents", None) or {}, objects.pop("agent", None)
+    if single is not None:  # as an older file has it
+        several = {key_of(str(dict(single).get("name"))): single, **several}
     is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
-    got = shortened(several)
-    require(
-        is_map and several, "agents", f"must be agents by keys that are words; got {got}. {FIX}"
-    )
+    message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
+    require(is_map and several, "agents", message)
     of_mixture = fields_of(MixtureConfig) if schema.learns else ()
     shared = {name: several[name] for name in of_mixture if name in several}
     keys, weights = sorted(several.keys() - shared.keys()), []

@@ -88,13 +88,14 @@ def _load(config: EvaluateConfig) -> Proxy:
     """
     path = header.find(config.proxy, "proxy", also=("real",))
     stored = header.read_config(path, "proxy")
-    task = kind = None
+    task = proxy_config = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
         task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
     if config.proxy_kind is not None:
-        kind = registry.configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
-    proxy = load_proxy(path, task, kind, "proxy")
+        fields = {**stored["proxy"], "name": config.proxy_kind}
+        proxy_config = registry.configure("proxy", fields)
+    proxy = load_proxy(path, task, proxy_config, "proxy")
     name = proxy.task.name
     is_same = config.env in (None, name, proxy.config["env"].get("name"))
     require(is_same, "env", f"must be the proxy's own task; got {config.env}. Set env={name}.")
