@@ -16,7 +16,7 @@ from sejax import envs
 from sejax.agents import make_agent
 from sejax.agents.base import Agent, Draw, Varied, drawing_key
 from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
-from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
+from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
@@ -66,10 +66,8 @@ def test_draws_fill_their_range_with_the_density_they_should_have(bounds):
 # --- narrow networks -----------------------------------------------------------------------------
 
 
-def configured(kind, hidden_size, batch_size):
-    dueling = functools.partial(DuelingDDQNConfig, feature_dim=4, stream_hidden_size=4)
-    make = {"ddqn": DDQNConfig, "dueling": dueling}[kind]
-    return make(
+def configured(hidden_size, batch_size):
+    return DDQNConfig(
         hidden_size=hidden_size, batch_size=batch_size, num_layers=2, activation="prelu",
         learning_rate=0.01, tau=0.1,
     )  # fmt: skip
@@ -96,9 +94,8 @@ def random_batch(num_columns, seed):
     return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)), **columns)
 
 
-@pytest.mark.parametrize("kind", ["ddqn", "dueling"])
-def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(kind):
-    configs = [configured(kind, SMALL, NUM_COLUMNS), configured(kind, LARGE, BATCH)]
+def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use():
+    configs = [configured(SMALL, NUM_COLUMNS), configured(LARGE, BATCH)]
     small, large = (DDQN(config, OBS_DIM, NUM_ACTIONS).agent() for config in configs)
     templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
 
