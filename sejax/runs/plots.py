@@ -92,7 +92,8 @@ def evaluation(
                 axis.plot(spread, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
                 mean = values.mean()
                 axis.hlines(mean, x - 0.28, x + 0.28, color=color, lw=2.5)
-                axis.annotate(f"{mean:,.1f}", (x + 0.3, mean), fontsize=9, va="center")
+                text = f"{mean:,.{0 if abs(mean) >= 1000 else 1}f}"
+                axis.annotate(text, (x + 0.3, mean), fontsize=9, va="center")
             axis.set_xticks(range(len(tables)), labels)
             axis.margins(x=0.2)
             axis.set_title(label, fontsize=10)

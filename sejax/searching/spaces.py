@@ -105,8 +105,8 @@ def _distribution(text: str, tags: list[str]) -> distributions.BaseDistribution:
       LookupError, TypeError, ValueError, ZeroDivisionError: if it is none.
     """
     call = _CALL.fullmatch(text)
-    kind, inner = (call[1], call[2]) if call else ("choice", text)
-    match kind, tags:
+    function, inner = (call[1], call[2]) if call else ("choice", text)
+    match function, tags:
         case "interval", [] | ["log"] | ["log", "inverse"]:
             low, high = map(float, split(inner))
             if "inverse" in tags:

@@ -30,7 +30,7 @@ from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, Search
 
-LONGEST_WAIT_S = 3600  # for another worker's write to the database
+WAIT = {"connect_args": {"timeout": 3600}}  # s, for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # what a database raises
 SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # of a trial
 
@@ -43,19 +43,17 @@ def open_study(search: Search) -> optuna.Study:
       OptunaError, SQLAlchemyError: if there is no database that can be used.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    config, folder = search.config, search.folder
+    folder = search.folder
     require_writable("search_dir", folder)
     (folder / "trials").mkdir(parents=True, exist_ok=True)
     store = Store(folder, search.settings(), field="search_dir", free=FREE)
-    wait = {"connect_args": {"timeout": LONGEST_WAIT_S}}
+    budgets = search.config.min_generations, search.config.max_generations
     with _lock(search, "study"):
         is_new = store.get("search") is None
         study = optuna.create_study(
             study_name=search.study,
-            storage=optuna.storages.RDBStorage(f"sqlite:///{folder / 'study.db'}", wait),
-            pruner=optuna.pruners.HyperbandPruner(
-                config.min_generations, config.max_generations, REDUCTION_FACTOR
-            ),
+            storage=optuna.storages.RDBStorage(f"sqlite:///{folder / 'study.db'}", WAIT),
+            pruner=optuna.pruners.HyperbandPruner(*budgets, REDUCTION_FACTOR),
             direction="maximize",
             load_if_exists=True,
         )
