@@ -27,7 +27,7 @@ STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines
 def learning_curve(
     rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path, title: str
 ) -> None:
-    """Draws `learning_curve.png`: scores above, agents' training steps below.
+    """Draws `learning_curve.png`: scores above, agents' training steps below where they vary.
 
     Args:
       rows: rows of `metrics.csv`, as text or numbers.
@@ -38,8 +38,13 @@ def learning_curve(
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
     agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
+    steps = {name: y for name, y in data.items() if name.startswith("train_steps_mean")}
+    lines = 1 + any(map(np.ptp, steps.values()))
     with plt.rc_context(STYLE):
-        figure, (top, bottom) = plt.subplots(2, figsize=(7, 5.5), sharex=True, height_ratios=(2, 1))
+        figure, _ = plt.subplots(
+            lines, figsize=(7, 2.5 + 1.5 * lines), sharex=True, height_ratios=(2, 1)[:lines]
+        )
+        top, bottom = figure.axes[0], figure.axes[-1]
         label = "incumbent: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
@@ -48,15 +53,18 @@ def learning_curve(
         for agent, color in zip(agents, itertools.cycle(AGENTS)):
             style = {"color": color, "lw": 1.3, "ls": "-."}
             top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
-            bottom.plot(x, data[f"train_steps_mean_{agent}"], **style)
+            if lines > 1:
+                bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
             top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
         top.set_ylabel("score" if solved_score is None else "return on the real task")
         top.set_title(title)
         top.legend(frameon=False, fontsize=9, loc="best")
-        bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=1.8)
-        bottom.set(xlabel="generation", ylabel="training steps\nof an agent", ylim=(0, None))
+        bottom.set_xlabel("generation")
+        if lines > 1:
+            bottom.plot(x, steps["train_steps_mean"], color=STEPS, lw=1.8)
+            bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
@@ -67,7 +75,7 @@ def evaluation(
     path: Path,
     title: str,
 ) -> None:
-    """Draws what agents trained in each world reached, and what it took.
+    """Draws what agents trained in each world reached and, where it varies, what it took.
 
     A point for each agent; the mean as a line and a number.
 
@@ -81,10 +89,13 @@ def evaluation(
     worlds = list(dict.fromkeys(world for world, _ in tables))
     is_one = len(worlds) == len(tables)  # agent
     labels = [f"trained on\n{world}" if is_one else f"{key}\n{world}" for world, key in tables]
+    numbers = {name: np.concatenate([x[name] for x in tables.values()]) for name in PANELS}
+    panels = [name for name in PANELS if name == "test_return" or np.ptp(numbers[name])]
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, 3, figsize=(3 * max(3, 1.3 * len(tables)), 3.4))
+        size = len(panels) * max(3, 1.3 * len(tables)), 3.4
+        figure, axes = plt.subplots(1, len(panels), squeeze=False, figsize=size)
         figure.suptitle(title, fontsize=11)
-        for axis, (column, label) in zip(axes, PANELS.items(), strict=True):
+        for axis, column in zip(figure.axes, panels, strict=True):
             for x, ((world, _), table) in enumerate(tables.items()):
                 values = np.asarray(table[column], float)
                 color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
@@ -96,11 +107,11 @@ def evaluation(
                 axis.annotate(text, (x + 0.3, mean), fontsize=9, va="center")
             axis.set_xticks(range(len(tables)), labels)
             axis.margins(x=0.2)
-            axis.set_title(label, fontsize=10)
+            axis.set_title(PANELS[column], fontsize=10)
             if column != "test_return":
                 axis.set_ylim(bottom=0)
         if solved_reward is not None:
-            axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+            axes[0, 0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
 
 
