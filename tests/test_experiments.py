@@ -177,7 +177,7 @@ def test_all_experiments_are_listed_and_nothing_else_is_a_command(capsys):
 
 def test_commands_in_the_docs_are_accepted():
     root = Path(__file__).parents[1]
-    pages = [root / "README.md", *(root / "docs").rglob("*.md")]
+    pages = [*(root / "docs").rglob("*.md"), *(root / "results").rglob("*.md")]
     text = "\n".join(page.read_text() for page in pages)
     commands = set(re.findall(r"python -m experiments\.([a-z]\w+)([^`\n#|]*)", text))
     assert len(commands) > 20

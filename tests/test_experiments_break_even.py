@@ -66,8 +66,8 @@ def test_the_cheapest_bandit_is_one_whose_students_are_good_enough(tmp_path, mon
     assert found["best_of_four_real_steps"] == 32_000
     assert found["best_of_four_break_even"] == 32
     (row,) = break_even.make_table(break_even.with_nulls(summary, tmp_path)).to_dict("records")
-    assert row["agents until it pays"].startswith("1,000 [")
-    assert row["a bandit of the best of four"] == "32,000; 199.0"
+    assert row["agents until it breaks even"].startswith("1,000 [")
+    assert row["an SE of the best of four"] == "32,000; 199.0"
 
 
 def test_costs_are_those_of_the_card():

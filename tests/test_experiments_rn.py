@@ -157,7 +157,7 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
     assert summary["steps_mean"].tolist() == [155, 185, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
     alone = rn_curves.summarise(curves_of("icm", 2), max_steps=300)
-    assert rn_curves.make_table(alone)["of the bare agent's"].tolist() == [""]
+    assert rn_curves.make_table(alone)["share of those without an RN"].tolist() == [""]
 
 
 @pytest.mark.parametrize(("world", "groups", "drawn", "independent"), [

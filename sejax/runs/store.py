@@ -104,9 +104,9 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self.damaged(name, error) from error
         self._is_used = True
-        differing = differences(stored, self.settings, self._free, most=3)
+        differing = differences(stored, self.settings, self._free, most=2)
         if differing:
-            differing = differences(self._completed(stored), self.settings, self._free, most=3)
+            differing = differences(self._completed(stored), self.settings, self._free, most=2)
         if differing:
             must = "must be new or hold what was made with the same settings"
             raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
