@@ -51,7 +51,7 @@ def learning_curve(
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
         for agent, color in zip(agents, itertools.cycle(AGENTS)):
-            style = {"color": color, "lw": 1.3, "ls": "-."}
+            style: dict[str, Any] = {"color": color, "lw": 1.3, "ls": "-."}
             top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
             if lines > 1:
                 bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)
@@ -65,7 +65,7 @@ def learning_curve(
         if lines > 1:
             bottom.plot(x, steps["train_steps_mean"], color=STEPS, lw=1.8)
             bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
-        bottom.xaxis.get_major_locator().set_params(integer=True)
+        bottom.locator_params(axis="x", integer=True)
         _write(figure, path)
 
 
