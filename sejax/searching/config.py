@@ -26,7 +26,7 @@ class SearchConfig(Options):
     """The fields of `python -m sejax.search`; all others are those of `sejax.run`.
 
     The defaults are the paper's setting, BOHB with a reduction factor of 3 (appendix, "SE
-    hyperparameters"; `docs/reference.md` 7.10).
+    hyperparameters").
 
     Attributes:
       trials: trials that end, pruned or complete
