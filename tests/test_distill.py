@@ -126,7 +126,7 @@ def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
 @pytest.mark.parametrize(
     "word",
     [
-        *("num_snapshots=5", "search.num_top=5", "search.generationz=5", "agent=nothing"),
+        *("num_snapshots=0", "search.num_top=5", "search.generationz=5", "agent=nothing"),
         *("generations=5", "proxy.hidden_size=5"),
         *("policy=sax", "policy=nothing:act", "policy=td3"),
         *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),

@@ -51,7 +51,6 @@ def test_lanes_are_single_environments(name):
 def test_lanes_have_their_own_attributes_and_step_together():
     envs = sejax.gym.make_sb3("cartpole", 3)
     assert envs.get_attr("render_mode") == [None] * 3 and not envs.has_attr("nothing")
-    assert [x.horizon for x in envs.get_attr("config", indices=[0, 2])] == [1, 1]
     envs.set_attr("tag", 7)
     envs.set_attr("tag", 8, indices=[1])
     assert envs.get_attr("tag") == [7, 8, 7]

@@ -28,15 +28,21 @@ def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
     for evaluation in proxy.on_proxy:
         means.setdefault(evaluation.agent, evaluation.return_mean)
     solving = [agent for agent, mean in means.items() if mean >= solved_reward]
+    assert proxy.learning
     return {
         "name": f"`{proxy.name}`",
-        "learned with": proxy.row["learned with"],
+        "learned with": "a policy" if proxy.is_distilled else ", ".join(proxy.scores),
         "solved by": ", ".join(solving) or "none",
         "not by": ", ".join(agent for agent in means if agent not in solving),
-        "score": proxy.row["return"],
-        "steps": proxy.row["steps"],
-        "real steps": proxy.row["real steps"],
+        "score": spread([each.return_mean for each in proxy.on_proxy], ".1f"),
+        "steps": spread([each.train_steps for each in proxy.on_proxy], ",.0f"),
+        "real steps": f"{proxy.learning.real_steps:,}",
     }
+
+
+def spread(values: list[float], spec: str) -> str:
+    """The lowest and the highest of some numbers."""
+    return " to ".join(dict.fromkeys(format(end, spec) for end in (min(values), max(values))))
 
 
 if __name__ == "__main__":

@@ -73,7 +73,6 @@ class PretrainedProxy:
       kind: se, rn, or the name of another configuration.
       task: name of the task that it stands in for.
       settings: the proxy's configuration, plain values.
-      size_kb: size of the file in units of 1,000 bytes.
       scores: mean score of the incumbent with each agent that it was learned with, in the
         generation that the proxy is of; for an SE a test return. Empty if it was not recorded.
       objective: name of the objective that the scores are of; "" if it was not recorded.
@@ -88,7 +87,6 @@ class PretrainedProxy:
     kind: str
     task: str
     settings: dict[str, Any]
-    size_kb: float
     scores: dict[str, float] = field(default_factory=dict)
     objective: str = ""
     generation: int | None = None
@@ -103,11 +101,6 @@ class PretrainedProxy:
         return self.policy_return is not None
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """The agents that it was learned with."""
-        return tuple(self.scores)
-
-    @property
     def on_proxy(self) -> tuple[Evaluation, ...]:
         """The evaluations of agents that trained on it, and not on the real task."""
         return tuple(x for x in self.evaluations if x.world == "proxy")
@@ -117,34 +110,8 @@ class PretrainedProxy:
         """The model card, in Markdown."""
         return card_of(self, self.name)
 
-    @property
-    def row(self) -> dict[str, str]:
-        """The cells of a table of proxies, by the names of their columns."""
-        learning = self.learning
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "task": self.task,
-            "learned with": "a policy" if self.is_distilled else ", ".join(self.agents),
-            "tested with": ", ".join(dict.fromkeys(each.agent for each in self.on_proxy)),
-            "return": spread([each.return_mean for each in self.on_proxy], ".1f"),
-            "steps": spread([each.train_steps for each in self.on_proxy], ",.0f"),
-            "CPU s": f"{learning.cpu_s:,.0f}" if learning and learning.cpu_s else "",
-            "real steps": f"{learning.real_steps:,}" if learning else "",
-            "kB": f"{self.size_kb:.1f}",
-        }
 
-
-class Zoo(tuple[PretrainedProxy, ...]):
-    """Proxies, which print as a table."""
-
-    def __repr__(self) -> str:
-        table = [[*self[0].row], *([*proxy.row.values()] for proxy in self)] if self else []
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        return "\n".join("  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table)
-
-
-def pretrained() -> Zoo:
+def pretrained() -> tuple[PretrainedProxy, ...]:
     """The proxies that ship with the package, by name; `sejax.load(name)` loads one.
 
     Example:
@@ -152,7 +119,7 @@ def pretrained() -> Zoo:
       ['acrobot', 'acrobot-distilled']
     """
     files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
-    return Zoo(describe(header.read(file, single=True)) for file in files)
+    return tuple(describe(header.read(file, single=True)) for file in files)
 
 
 def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
@@ -178,21 +145,9 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
         "kind": learned.kind,
         "task": learned.task,
         "settings": config["proxy"],
-        "size_kb": path.stat().st_size / 1000,
         "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
     }
     return from_plain(PretrainedProxy, values, "record")
-
-
-def spread(values: Sequence[float], spec: str) -> str:
-    """The lowest and the highest of some numbers; nothing if there are none.
-
-    Example:
-      >>> spread([199.5, 180.0], ".1f"), spread([4000.0, 4000.2], ",.0f")
-      ('180.0 to 199.5', '4,000')
-    """
-    ends = (min(values), max(values)) if values else ()
-    return " to ".join(dict.fromkeys(format(end, spec) for end in ends))
 
 
 # --- model cards ----------------------------------------------------------------------------------
@@ -253,7 +208,7 @@ def table(rows: Sequence[Mapping[str, str]]) -> str:
 
 def _facts(proxy: PretrainedProxy) -> dict[str, str]:
     """What is known of a proxy, by field: its settings, its scores, and what it cost."""
-    elsewhere = ("name", "kind", "task", "size_kb", "evaluations")
+    elsewhere = ("name", "kind", "task", "evaluations")
     plain = {name: x for name, x in to_plain(proxy).items() if name not in elsewhere}
     if proxy.learning:
         plain["learning"].pop("command")
