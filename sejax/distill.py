@@ -28,7 +28,7 @@ from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Options, as_text, counts, help_texts, option, require
-from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
+from sejax.options.plain import fields_of, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -94,13 +94,12 @@ def main(overrides: Sequence[str]) -> None:
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     parts = {"": DistillConfig, "copy.": CopyConfig, "search.": SearchConfig}
-    texts = {
-        f"{prefix}{name}": f"  # {text}"
+    lines = [
+        f"  {prefix}{name}={as_text(default)}  # {help_texts(part).get(name, '')}".rstrip(" #")
         for prefix, part in parts.items()
-        for name, text in help_texts(part).items()
-    }
-    defaults = flatten(to_plain(fields_of(DistillConfig)))
-    lines = [f"  {name}={as_text(x)}{texts.get(name, '')}" for name, x in defaults.items()]
+        for name, default in fields_of(part).items()
+        if name not in ("copy", "search")
+    ]
     return "\n".join([str(__doc__), "Its own fields, with their defaults:", *lines])
 
 

@@ -40,7 +40,7 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
     counts = [learning.generations, learning.real_steps]
     said = [f"`{proxy.task}`", f'sejax.load("{name}")', "Apache-2.0", learning.command]
     said += [f"{x.return_mean:.1f} ± {x.return_std:.1f}" for x in proxy.evaluations]
-    said += [f"{count:,}" for count in counts]
+    said += [f": {count}\n" for count in counts]
     assert proxy.card.startswith(f"# {name}\n") and all(text in proxy.card for text in said)
     assert min(counts) > 0
     if proxy.kind == "se":

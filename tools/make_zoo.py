@@ -9,7 +9,6 @@ from pathlib import Path
 
 import sejax
 from sejax.ops.files import write_text
-from sejax.proxies.zoo import table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "zoo.md"
@@ -43,6 +42,12 @@ def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
 def spread(values: list[float], spec: str) -> str:
     """The lowest and the highest of some numbers."""
     return " to ".join(dict.fromkeys(format(end, spec) for end in (min(values), max(values))))
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """A table in Markdown, of rows by the names of their columns."""
+    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def students(
         agent = make_agent(agent_config, ses[0][0].task, config.exploration)
         train = functools.partial(teach, ses, agent, config, keys)
         taught = store.once(f"students/{key}-{taught_by}", train)
-        table = rows.assign(agent=key, **taught)
+        table = rows.assign(agent=key, **{column: taught[column] for column in COLUMNS})
         returns = counted(table["test_return"])
         mean, worst = returns.mean(), returns.min()
         print(f"{len(table)} {key} students reach {mean:.1f}, the worst {worst:.1f}", flush=True)

@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from sejax.options import as_text, is_number, require, shortened
+import yaml
+
+from sejax.options import require, shortened
 from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
@@ -150,6 +152,8 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     return from_plain(PretrainedProxy, values, "record")
 
 
+FACTS = ("settings", "scores", "objective", "generation", "seed", "learning", "policy_return")
+
 # --- model cards ----------------------------------------------------------------------------------
 
 _KINDS = {"se": ["synthetic-environment"], "rn": ["reward-network"], "other": []}  # with tags
@@ -181,11 +185,15 @@ def card_of(
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
+    plain = to_plain(proxy)
+    if proxy.learning:
+        plain["learning"].pop("command")  # which the card has below
+    facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
         "front": json.dumps(license) if hub.is_address(source) else None,
         "tags": json.dumps(tags),
         **{name: "" if name == kind else None for name in _KINDS},
-        "facts": table([{"field": name, "value": text} for name, text in _facts(proxy).items()]),
+        "facts": yaml.safe_dump(facts, sort_keys=False).rstrip(),
         "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
         "command": proxy.learning and proxy.learning.command,
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
@@ -198,32 +206,6 @@ def card_of(
     parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
     kept = [x for x in parts if None not in map(values.get, re.findall(r"\{(\w+)\}", x))]
     return "\n\n".join(kept).format(**values)
-
-
-def table(rows: Sequence[Mapping[str, str]]) -> str:
-    """A table in Markdown, of rows by the names of their columns."""
-    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _facts(proxy: PretrainedProxy) -> dict[str, str]:
-    """What is known of a proxy, by field: its settings, its scores, and what it cost."""
-    elsewhere = ("name", "kind", "task", "evaluations")
-    plain = {name: x for name, x in to_plain(proxy).items() if name not in elsewhere}
-    if proxy.learning:
-        plain["learning"].pop("command")
-    texts = {name: _text(value) for name, value in plain.items()}
-    return {name: text for name, text in texts.items() if text}
-
-
-def _text(value: object) -> str:
-    """A plain value on one line; nothing for None."""
-    if isinstance(value, Mapping):
-        texts = {name: _text(inner) for name, inner in value.items()}
-        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
-    if is_number(value):
-        return f"{value:,.5g}" if isinstance(value, float) else f"{value:,}"
-    return "" if value is None else as_text(value)
 
 
 # --- sharing --------------------------------------------------------------------------------------
