@@ -24,7 +24,6 @@ from sejax.proxies.synthetic import SyntheticConfig
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
 LIMIT = np.float32(MAX_ABS_VALUE)
-Numbers = np.ndarray | float
 
 
 class SyntheticWorld:
@@ -112,7 +111,7 @@ class SyntheticWorld:
         raise InvalidAction(f"{action!r} is none of {space}")
 
     def step(
-        self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
+        self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None
     ) -> tuple[np.ndarray, Any, Any, Any, Any]:
         """One step of each episode.
 
