@@ -12,6 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
 
+from sejax import envs
 from sejax.gym import networks
 from sejax.gym.tasks import Env, Info, RealTask, space_of
 from sejax.options import as_python, fraction, registry, require, shortened
@@ -128,7 +129,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         weighs_info = self.config.shaping.weighs_info
         if not (weighs_info or self.config.augmented):
             return []
-        spec = configured("env", header.config["env"], header.task).spec
+        spec = envs.spec_of(configured("env", header.config["env"], header.task))
         keys = spec.info_keys if weighs_info else spec.augmented_keys
         return [GYMNASIUM_NAMES.get(key, key) for key in keys]
 
@@ -138,16 +139,13 @@ def _require_task(env: Env, header: Header) -> None:
     layers = [env]  # the innermost last
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
-    layers = [env]  # the innermost last
-    while isinstance(layers[-1], gymnasium.Wrapper):
-        layers.append(layers[-1].env)
-    learned, is_other = RealTask.of_spec(header.spec), isinstance(layers[-1], CliffWalkingEnv)
+    learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
     # Wrappers may make actions of one kind of another: some layer has the task's.
     action_kinds = [_kind(layer.action_space) for layer in layers]
     must = f"must be sejax's {shortened(header.task, 40)}, its observations changed by no wrapper"
     is_same = (
-        not is_other
+        not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, whose rules are others
         and _kind(env.observation_space) == _kind(learned.observation_space)
         and _kind(learned.action_space) in action_kinds
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)

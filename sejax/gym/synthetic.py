@@ -103,7 +103,7 @@ class SyntheticWorld:
         """
         if isinstance(self.action_space, spaces.Discrete):
             array = np.asarray(action)
-            if array.dtype.kind in "iu" and space.contains(array):
+            if array.dtype.kind in "iu" and space.contains(action):
                 return self._one_hot[array]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]

@@ -161,11 +161,6 @@ _ROW = (  # of an evaluation
     "| {0.agent} | {0.hparams} | {0.world} | {0.return_mean:.1f} ± {0.return_std:.1f} | "
     "{0.train_steps:,.0f} | {0.num_agents} |"
 )
-_BEST = {  # overrides of `sejax.evaluate` that train agents again as they were
-    "default": " agent={}",
-    "varied": " agent={} agent_hparams=varied",
-    "as_learned": " agent_hparams=as_learned",
-}
 
 
 def card_of(
@@ -184,6 +179,10 @@ def card_of(
     call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
+    if best and best.hparams != "as_learned":
+        words += f" agent={best.agent}"
+    if best and best.hparams != "default":
+        words += f" agent_hparams={best.hparams}"
     tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
     plain = to_plain(proxy)
     if proxy.learning:
@@ -200,7 +199,7 @@ def card_of(
         "gym": _GYM.format(call) if kind == "se" else "",
         "call": call,
         "source": source,
-        "overrides": words + (_BEST[best.hparams].format(best.agent) if best else ""),
+        "overrides": words,
         "license": license or SHIPPED_LICENSE,
     }
     parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
@@ -217,7 +216,6 @@ def push(
     *,
     private: bool = False,
     license: str = "apache-2.0",
-    message: str = "A proxy of sejax",
 ) -> str:
     """Puts a proxy on the Hugging Face Hub, from where `sejax.load("hf://USER/REPO")` loads it.
 
@@ -229,7 +227,6 @@ def push(
       repo: `USER/REPO`; made if it is not there.
       private: whether a new repository is private.
       license: name by which the Hub knows it; that of the shipped proxies if not given.
-      message: message of the commit.
 
     Returns:
       Its address, which `sejax.load` takes.
@@ -243,5 +240,5 @@ def push(
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
     files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
-    hub.upload(repo, files, message, private)
+    hub.upload(repo, files, "A proxy of sejax", private)
     return address
