@@ -83,7 +83,7 @@ def find(settings: SeMyopia) -> Iterator[Se]:
         shipped = [proxy.name for proxy in sejax.pretrained() if proxy.kind == "se"]
         files = [*shipped, *(str(x) for name in STORED for x in sorted(Path("results").glob(name)))]
     for file in files:
-        if header.read_config(file, "ses")["env"]["name"] == settings.env:
+        if header.read(file, "ses").header.config["env"]["name"] == settings.env:
             ses = sejax.load_set(file, option="ses", kind="se")
             for place in range(min(len(ses), settings.num_ses)):
                 yield Se(set_name(file), ses, ses[place])

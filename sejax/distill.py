@@ -28,7 +28,7 @@ from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Options, as_text, counts, help_texts, option, require
-from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
+from sejax.options.plain import fields_of, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -59,7 +59,7 @@ class DistillConfig(Options):
       independent_starts: Whether the numbers of an initial state are independent; else they have
         the visited states' covariance.
       num_snapshots: Policies that are taught: the best tested one of each of so many equal parts of
-        the search.
+        the search, at most as many as it tests.
       num_students: Students of each agent on the SE of each policy, which choose one of the SEs.
       num_tested: Others of each agent, on the chosen SE.
     """
@@ -73,14 +73,6 @@ class DistillConfig(Options):
     num_snapshots: int = option(6, counts("something must be taught"))
     num_students: int = option(4, counts("an SE is chosen by what it teaches"))
     num_tested: int = option(10, counts("a card says what an SE teaches"))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        num_tests = -(-self.search.generations // self.search.test_every)
-        is_fit = self.policy is not None or self.num_snapshots <= num_tests
-        must = f"must be at most {num_tests}, the policies that the search tests"
-        got = f"got {self.num_snapshots}. Set search.test_every=1"
-        require(is_fit, "num_snapshots", f"{must}; {got}.")
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -102,13 +94,12 @@ def main(overrides: Sequence[str]) -> None:
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     parts = {"": DistillConfig, "copy.": CopyConfig, "search.": SearchConfig}
-    texts = {
-        f"{prefix}{name}": f"  # {text}"
+    lines = [
+        f"  {prefix}{name}={as_text(default)}  # {help_texts(part).get(name, '')}".rstrip(" #")
         for prefix, part in parts.items()
-        for name, text in help_texts(part).items()
-    }
-    defaults = flatten(to_plain(fields_of(DistillConfig)))
-    lines = [f"  {name}={as_text(x)}{texts.get(name, '')}" for name, x in defaults.items()]
+        for name, default in fields_of(part).items()
+        if name not in ("copy", "search")
+    ]
     return "\n".join([str(__doc__), "Its own fields, with their defaults:", *lines])
 
 
@@ -188,12 +179,13 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
         student_keys = jax.random.split(keys[CHOOSE], own.num_students)
-        rows = students(ses, lessons, config, student_keys, store).assign(use=CHOOSE)
-        marks = grades(rows)
+        rows = students(ses, lessons, config, student_keys, store)
+        rows["use"], marks = CHOOSE, grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
+    se, lesson = ses[best], lessons[best]
     student_keys = jax.random.split(keys[TEST], own.num_tested)
-    tested = students([ses[best]], [lessons[best]], config, student_keys, store)
+    tested = students([se], [lesson], config, student_keys, store)
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
@@ -205,15 +197,17 @@ def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str
         "train_steps": int(rows["train_steps"].sum()),
         "cpu_s": round(float(spent["cpu_s"]), 1),
     }
+    record: dict[str, Any] = {
+        "generation": lesson.generation,
+        "seed": config.seed,
+        "learning": learning,
+    }
+    record |= {"policy_return": lesson.policy_return, "evaluations": evaluations_of(tested)}
     path, plain = folder / "proxy.safetensors", configuration.plain(config)
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
-    generation, _, _, policy_return = lessons[best]
-    record: dict[str, Any] = {"generation": generation, "seed": config.seed}
-    record |= {"policy_return": policy_return, "evaluations": evaluations_of(tested)}
-    record["learning"] = learning
-    save(path, *ses[best], learned_with, **record)
-    write_text(folder / "card.md", zoo.describe(header.read(path, single=True)).card + "\n")
-    print(f"{path} holds the SE of generation {generation}.")
+    save(path, *se, learned_with, **record)
+    write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
+    print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
 
 

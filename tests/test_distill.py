@@ -68,7 +68,7 @@ def test_the_se_that_teaches_best_is_written_and_says_what_it_is(folder):
     assert set(tested["policy_return"]) == {shown.policy_return}
     (evaluation,) = shown.evaluations
     assert evaluation.return_mean == pytest.approx(tested["test_return"].mean())
-    assert shown.is_distilled and "| policy_return |" in shown.card
+    assert shown.is_distilled and "policy_return:" in shown.card
     # Searches, the recorded episodes, and all tests of students.
     assert shown.learning.real_steps == curve["real_steps"].sum() + rows["real_steps"].sum()
     assert shown.learning.train_steps == 6 * 60
@@ -126,7 +126,7 @@ def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
 @pytest.mark.parametrize(
     "word",
     [
-        *("num_snapshots=5", "search.num_top=5", "search.generationz=5", "agent=nothing"),
+        *("num_snapshots=0", "search.num_top=5", "search.generationz=5", "agent=nothing"),
         *("generations=5", "proxy.hidden_size=5"),
         *("policy=sax", "policy=nothing:act", "policy=td3"),
         *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),

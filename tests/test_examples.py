@@ -101,7 +101,7 @@ def test_a_command_takes_parts_from_its_folder_and_a_file_imports_none(examples,
              "training.max_steps=30", "run_dir=here"]  # fmt: skip
     printed(sys.executable, "-m", "sejax.run", *choices, *small, cwd=tmp_path)
     here, before = tmp_path / "here", set(sys.modules)
-    assert header.read_config(here)["env"] == {"name": "own_task:make_reacher", "size": 4}
+    assert header.read(here).header.config["env"] == {"name": "own_task:make_reacher", "size": 4}
     assert refused(sejax.load, here) == "proxy"
     assert set(sys.modules) == before
     proxy = examples("own_proxy").LinearSE()

@@ -135,7 +135,7 @@ def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, 
         "tags": ["reinforcement-learning", "jax", "synthetic-environment", "pendulum"],
     }  # fmt: skip
     assert card.startswith("# swing-up\n") and card.endswith("## License\n\nmit")
-    for said in ("| generation | 7 |", "| seed | 2 |", "| scores | sac -150 |", "sejax[hub]",
+    for said in ("generation: 7", "seed: 2", "scores:\n  sac: -150.0", "sejax[hub]",
                  'sejax.load("hf://me/swing-up")', 'sejax.gym.make("hf://me/swing-up")',
                  "proxy=hf://me/swing-up`"):  # fmt: skip
         assert said in card

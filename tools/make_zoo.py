@@ -9,7 +9,6 @@ from pathlib import Path
 
 import sejax
 from sejax.ops.files import write_text
-from sejax.proxies.zoo import table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "zoo.md"
@@ -28,15 +27,27 @@ def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
     for evaluation in proxy.on_proxy:
         means.setdefault(evaluation.agent, evaluation.return_mean)
     solving = [agent for agent, mean in means.items() if mean >= solved_reward]
+    assert proxy.learning
     return {
         "name": f"`{proxy.name}`",
-        "learned with": proxy.row["learned with"],
+        "learned with": "a policy" if proxy.is_distilled else ", ".join(proxy.scores),
         "solved by": ", ".join(solving) or "none",
         "not by": ", ".join(agent for agent in means if agent not in solving),
-        "score": proxy.row["return"],
-        "steps": proxy.row["steps"],
-        "real steps": proxy.row["real steps"],
+        "score": spread([each.return_mean for each in proxy.on_proxy], ".1f"),
+        "steps": spread([each.train_steps for each in proxy.on_proxy], ",.0f"),
+        "real steps": f"{proxy.learning.real_steps:,}",
     }
+
+
+def spread(values: list[float], spec: str) -> str:
+    """The lowest and the highest of some numbers."""
+    return " to ".join(dict.fromkeys(format(end, spec) for end in (min(values), max(values))))
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """A table in Markdown, of rows by the names of their columns."""
+    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 if __name__ == "__main__":

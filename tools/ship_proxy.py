@@ -53,7 +53,7 @@ def main() -> None:
     target = args.out / f"{args.name}.safetensors"
     save(target, proxy, **more, evaluations=[*itertools.chain(*evaluated)])
     shipped = zoo.describe(header.read(target))
-    print(f"{shipped.card}\n{zoo.Zoo([shipped])}\n\n{target}")
+    print(f"{shipped.card}\n\n{target}")
 
 
 def save(path: Path, proxy: sejax.Proxy, **more: object) -> None:

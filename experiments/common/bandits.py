@@ -217,8 +217,8 @@ def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
 
     def generation(key: Array, policy: Policy) -> tuple[Policy, Array, Any]:
         key_search, key_test = jax.random.split(key)
-        policy, tried = search.generation(key_search, policy, 0)  # its step size stays
-        return policy, tried.num_steps, search.test(key_test, policy)
+        policy, _, num_steps = search.generation(key_search, policy, 0)  # its step size stays
+        return policy, num_steps, search.test(key_test, policy)
 
     init = search.init()
     return agent, init, jax.jit(generation).lower(jax.random.key(0), init).compile()

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
@@ -56,7 +56,6 @@ class SearchConfig(Options):
         bound; of discrete actions in units of the policy's own outputs.
       alive_bonus: Subtracted from each step's reward while searching; unless given, the task's
         reward for being healthy.
-      short_steps: The first generations have shorter episodes.
       num_tests: episodes without the error
     """
 
@@ -72,8 +71,6 @@ class SearchConfig(Options):
     constant: float = option(0.5, not_negative("it is a share of the generations"))
     policy_error: float = option(0.1, not_negative("it is a size"))
     alive_bonus: float = option(0.0, finite("it is a reward"))
-    short_steps: int | None = option(None, counts("an episode has steps"))
-    short_generations: int = option(0, counts("it counts generations", least=0))
     num_tests: int = option(5, counts("a policy must be tested"))
     test_every: int = option(10, counts("it counts generations"))
 
@@ -113,30 +110,20 @@ class Policy(NamedTuple):
         return [(kernel, max_action * weights[:, -1] - kernel @ mean)]
 
 
-class Generation(NamedTuple):
-    """What a generation was.
-
-    Attributes:
-      returns: of the episodes of all directions, `[2 * num_directions]`, bonuses included.
-      num_steps: on the real task.
-    """
-
-    returns: Float[Array, " episode"]
-    num_steps: Int[Array, ""]
-
-
 class Search(NamedTuple):
     """The pure functions of a search.
 
     Attributes:
       init: `() -> Policy`, one that does nothing.
-      generation: `(key, policy, number) -> (Policy, Generation)`.
+      generation: `(key, policy, number) -> (policy, returns, num_steps)`: the next policy, the
+        returns of the episodes of all directions, `[2 * num_directions]`, bonuses included, and the
+        number of steps on the real task.
       test: `(key, policy) -> Tests`, episodes without the emulated error.
       record: `(key, policy) -> Steps`, every step of the same episodes.
     """
 
     init: Callable[[], Policy]
-    generation: Callable[[Array, Policy, Array | int], tuple[Policy, Generation]]
+    generation: Callable[[Array, Policy, Array | int], tuple[Policy, Array, Array]]
     test: Callable[[Array, Policy], Any]
     record: Callable[[Array, Policy], Any]
 
@@ -164,8 +151,9 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
       >>> import sejax
       >>> task = sejax.envs.make("mountain_car")
       >>> search = make_search(SearchConfig(num_directions=4, num_top=2), task, devices=1)
-      >>> policy, tried = jax.eval_shape(search.generation, jax.random.key(0), search.init(), 0)
-      >>> policy.weights.shape, tried.returns.shape
+      >>> policy, returns, _ = jax.eval_shape(
+      ...     search.generation, jax.random.key(0), search.init(), 0)
+      >>> policy.weights.shape, returns.shape
       ((3, 3), (8,))
     """
     require_vectors(task)
@@ -177,18 +165,17 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         zeros = jnp.zeros(task.obs_dim)
         return Policy(jnp.zeros(shape), jnp.float32(0), zeros, zeros)
 
-    def episode(key: Array, policy: Policy, size: Array, limit: Array) -> tuple[Array, Array]:
+    def episode(key: Array, policy: Policy, size: Array) -> tuple[Array, Array]:
         """The return of an episode with an error of this size, and its steps."""
         key_error, key_play = jax.random.split(key)
         weights = policy.weights + size * random_map(key_error, shape)
-        params = task.params.replace(max_steps_in_episode=limit)
-        tests = play(key_play, policy._replace(weights=weights), params=params)
+        tests = play(key_play, policy._replace(weights=weights))
         return tests.returns[0], tests.num_steps[0]
 
     width = 1 if task.num_actions is None else None
     spread = spread_over_devices(episode, devices, cpu_num_parallel=width)
 
-    def generation(key: Array, policy: Policy, number: Array | int) -> tuple[Policy, Generation]:
+    def generation(key: Array, policy: Policy, number: Array | int) -> tuple[Policy, Array, Array]:
         key_directions, key_episodes, key_record = jax.random.split(key, 3)
         directions = jax.random.normal(key_directions, (config.num_directions, *shape))
         weights = policy.weights + config.noise_std * jnp.concatenate([directions, -directions])
@@ -198,12 +185,8 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         size = jnp.float32(config.policy_error)
         if task.num_actions is not None:  # only the outputs' relative size counts
             size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
-        limit = jnp.int32(task.max_steps)
-        if config.short_steps is not None:
-            is_short = number < config.short_generations
-            limit = jnp.where(is_short, min(config.short_steps, task.max_steps), limit)
-        sizes, limits = (jnp.broadcast_to(x, num_episodes) for x in (size, limit))
-        returns, num_steps = spread(keys, tried._replace(weights=weights), sizes, limits)
+        sizes = jnp.broadcast_to(size, num_episodes)
+        returns, num_steps = spread(keys, tried._replace(weights=weights), sizes)
         plus, minus = jnp.split(_finite(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
@@ -211,7 +194,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         step = step_size(config, number) / (config.num_top * deviation) * slope
         seen = record_one(key_record, policy)  # an episode of the policy itself gives the moments
         policy = with_moments(policy._replace(weights=policy.weights + step), seen.obs, seen.valid)
-        return policy, Generation(returns, num_steps.sum() + seen.valid.sum())
+        return policy, returns, num_steps.sum() + seen.valid.sum()
 
     test, record = (make(agent, task, config.num_tests) for make in (make_tester, make_recorder))
     return Search(init=init, generation=generation, test=test, record=record)
@@ -291,7 +274,7 @@ def searched(
     Args:
       options: of the search.
       task: the real task.
-      num_lessons: parts of the search.
+      num_lessons: parts of the search; at most as many as policies are tested.
       keys: `search`, `test` and `record`.
       store: where each step of the search is kept.
       devices: number of devices that episodes are spread over; None for all.
@@ -309,8 +292,8 @@ def searched(
         key_search, key_test = (jax.random.fold_in(keys[use], start) for use in ("search", "test"))
         for number in range(first, last):
             key = jax.random.fold_in(key_search, number)
-            policy, tried = search.generation(key, policy, number)
-            num_steps += int(tried.num_steps)
+            policy, _, num_taken = search.generation(key, policy, number)
+            num_steps += int(num_taken)
         tests = search.test(jax.random.fold_in(key_test, last), policy)
         mean, std = float(tests.returns.mean()), float(tests.returns.std())
         real_steps, cpu_s = num_steps + int(tests.num_steps.sum()), time.process_time() - started
@@ -332,7 +315,7 @@ def searched(
     best = int(max(rows, key=_test_mean)["start"])
     advance(best, firsts[num_tried:], ends[best])
     went_on = [row for row in rows if row["start"] == best]
-    parts = np.array_split(np.arange(len(went_on)), num_lessons)
+    parts = np.array_split(np.arange(len(went_on)), min(num_lessons, len(went_on)))
     chosen = [max((went_on[i] for i in part), key=_test_mean) for part in parts]
     lessons = [_lesson(options, search, task, keys["record"], row) for row in chosen]
     return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])

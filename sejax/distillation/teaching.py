@@ -45,9 +45,9 @@ def students(
     """
     # By the weights, as what `policy` names may have changed.
     taught_by = fingerprint({str(i): weights for i, (_, weights) in enumerate(ses)})
-    policies = [(lesson.generation, lesson.policy_return) for lesson in lessons]
-    rows = pd.DataFrame(policies, columns=["generation", "policy_return"]).assign(agent="")
-    rows = rows.merge(pd.DataFrame({"student": range(len(keys))}), how="cross")
+    names = ("generation", "policy_return", "agent", "student")
+    lines = [(x.generation, x.policy_return, "", i) for x in lessons for i in range(len(keys))]
+    rows = pd.DataFrame(lines, columns=names)
     tables = []
     for key, agent_config in config.agents.items():
         agent = make_agent(agent_config, ses[0][0].task, config.exploration)

@@ -1,6 +1,5 @@
 """From the name or the file of a proxy to environments."""
 
-import re
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +10,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
-from sejax.gym.tasks import Env, RealTask, make_gymnasium, real_env, se_task
-from sejax.options import ConfigError, as_python, counts, registry, require, shortened
+from sejax.gym.tasks import Env, RealTask, real_env, se_task
+from sejax.options import ConfigError, as_python, counts, registry
 from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def make(
         both know. Episodes of an SE keep the step limit in its file. For an RN an id;
         `RewardNetwork` goes around any environment.
       render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
-        rgb_array.
+        it.
 
     Raises:
       ConfigError: if there is no such file, it is damaged, it holds several proxies or one that is
@@ -42,24 +41,13 @@ def make(
     Example:
       >>> make("acrobot").observation_space.shape
       (6,)
-      >>> make("cartpole-rn").spec.id
-      'sejax/cartpole-rn'
     """
-    header, world = _read(source, task, render_mode)
-    name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
-    kwargs = {"source": str(source), "task": task, "render_mode": render_mode}
+    header, world = _read(source, task)
     if world:
-        env = SyntheticEnv(world)
-        env.spec = _spec(name, **kwargs)
-        return env
-    fix = "sejax.gym.RewardNetwork(env, source)"
-    must = f"must be an id of Gymnasium; got {shortened(task)}. Set {fix}."
-    require(isinstance(task, str | None), "task", must)
-    options = {"render_mode": render_mode}
-    real = make_gymnasium(str(task), **options) if task else real_env(header, fix, **options)
-    rewards = RewardNetwork(real, source)
-    rewards._cached_spec = _spec(f"{name}-rn", **kwargs)  # it makes all of it
-    return rewards
+        return SyntheticEnv(world)
+    options: dict[str, Any] = {"render_mode": render_mode, "disable_env_checker": True}
+    real = gymnasium.make(str(task), **options) if task else real_env(header, **options)
+    return RewardNetwork(real, source)
 
 
 def make_vec(
@@ -68,7 +56,6 @@ def make_vec(
     task: RealTask | str | None = None,
     *,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    render_mode: str | None = None,
 ) -> VectorEnv[Any, Any, Any]:
     """Makes a stored proxy a Gymnasium vector environment.
 
@@ -80,7 +67,6 @@ def make_vec(
       num_envs: number of environments.
       task: as of `make`.
       autoreset_mode: what happens where an episode ends; see `SyntheticVectorEnv`.
-      render_mode: as of `make`.
 
     Raises:
       ConfigError: as `make`, or for less than one environment.
@@ -91,10 +77,9 @@ def make_vec(
       >>> obs.shape, envs.metadata["autoreset_mode"].value
       ((8, 4), 'NextStep')
     """
-    num_envs = _count(num_envs)
-    _, world = _read(source, task, render_mode)
+    _, world = _read(source, task, num_envs)
     if world is None:
-        env_fns = [partial(make, source, task, render_mode=render_mode)] * num_envs
+        env_fns = [partial(make, source, task)] * num_envs
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
     return SyntheticVectorEnv(world, num_envs, autoreset_mode)
 
@@ -113,7 +98,6 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     Raises:
       ConfigError: as `make_vec`, or without Stable-Baselines3.
     """
-    num_envs = _count(num_envs)
     try:
         from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -121,7 +105,7 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     except ImportError as error:
         message = f"make_sb3 needs Stable-Baselines3; got {error}. Type pip install 'sejax[sb3]'."
         raise ConfigError(message) from error
-    _, world = _read(source, task)
+    _, world = _read(source, task, num_envs)
     if world is None:
         return DummyVecEnv([partial(make, source, task)] * num_envs)
     return SyntheticVecEnv(world, num_envs)
@@ -139,34 +123,28 @@ def register() -> list[str]:
       ('sejax.gym:sejax/acrobot', Discrete(3))
     """
     for name in pretrained_names():
-        gymnasium.registry.setdefault(f"sejax/{name}", _spec(name, source=name))
+        # With `max_episode_steps` Gymnasium would add a second time limit.
+        spec = EnvSpec(
+            f"sejax/{name}",
+            "sejax.gym:make",
+            vector_entry_point="sejax.gym:make_vec",
+            kwargs={"source": name},
+        )
+        gymnasium.registry.setdefault(spec.id, spec)
     return [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
 
 
-def _spec(name: str, **kwargs: Any) -> EnvSpec:
-    """How Gymnasium makes it; with `max_episode_steps` it would add a second time limit."""
-    many = "sejax.gym:make_vec"
-    return EnvSpec(f"sejax/{name}", "sejax.gym:make", vector_entry_point=many, kwargs=kwargs)
-
-
-def _count(num_envs: float) -> int:
-    num_envs = as_python(num_envs)
-    counts("each is an episode at a time")("num_envs", num_envs, 8)
-    return int(num_envs)
-
-
 def _read(
-    source: Source, task: RealTask | str | None, render_mode: str | None = None
+    source: Source, task: RealTask | str | None, num_envs: int = 1
 ) -> tuple[Header, SyntheticWorld | None]:
     """The header of a file, and its SE; None if it is an RN.
 
     Raises:
       ConfigError: as `make`.
     """
+    counts("each is an episode at a time")("num_envs", as_python(num_envs), 8)
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
-    must = f"must be None, as an SE has no picture; got {shortened(render_mode)}."
-    require(render_mode in (None, "rgb_array"), "render_mode", must)
     config = registry.configure("proxy", header.config["proxy"])
     return header, SyntheticWorld(weights, config, se_task(header, config, task))

@@ -1,6 +1,5 @@
 """Reward networks (RNs) in NumPy, around a Gymnasium environment of their task."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +7,17 @@ import gymnasium
 import numpy as np
 from gymnasium import ObservationWrapper
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
-from gymnasium.spaces import Box, Discrete, Space, flatdim
+from gymnasium.spaces import Discrete, Space, flatdim
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
 
+from sejax import envs
 from sejax.gym import networks
-from sejax.gym.tasks import GYMNASIUM_IDS, Env, Info, RealTask, space_of
-from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
+from sejax.gym.tasks import Env, Info, RealTask, space_of
+from sejax.options import as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import Header, check_tensors, read
+from sejax.proxies.header import Header, check_tensors, configured, read
 from sejax.proxies.reward import RewardConfig
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
@@ -43,14 +43,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
       source: a run directory, a safetensors file of one RN, or the name of one that ships with the
         package.
       discount: gamma of the agent that will train.
-      info_keys: what of a step's `info` the RN weighs (`*_weighted_info`) or sees (`augmented`), in
-        the order of `sejax.Task`; needed for a task that is not sejax's own.
-      limit_is_terminal: whether the agent does not bootstrap at the step limit, for an RN with
-        `zero_at_terminal`; agents written for Gymnasium do.
 
     Raises:
-      ConfigError: if the environment is not of the RN's task as far as its spaces tell, or the keys
-        are not known.
+      ConfigError: if the environment is not of the RN's task as far as its spaces tell.
 
     Example:
       >>> env = RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount=0.98)
@@ -60,25 +55,15 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
       (1.0, False)
     """
 
-    def __init__(
-        self,
-        env: Env,
-        source: str | Path,
-        discount: float | None = None,
-        info_keys: Sequence[str] | None = None,
-        limit_is_terminal: bool = False,
-    ):
-        options: Info = {"source": str(source), "discount": discount, "info_keys": info_keys}
-        options["limit_is_terminal"] = limit_is_terminal
-        RecordConstructorArgs.__init__(self, **options)
+    def __init__(self, env: Env, source: str | Path, discount: float | None = None):
+        RecordConstructorArgs.__init__(self, source=str(source), discount=discount)
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(header.discount if discount is None else discount)
         fraction()("discount", discount, header.discount)
         self.discount = float(discount)
-        self.limit_is_terminal = limit_is_terminal
-        self._info_keys = self._keys(header.task, info_keys)
+        self._info_keys = self._keys(header)
         num_inputs = space_of(env.observation_space, "env.observation_space").size
         _require_task(env, header)
         num_keys = len(self._info_keys)
@@ -105,12 +90,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """One step of the environment, with the RN's reward.
 
         Raises:
-          ConfigError: if `info` lacks what the RN weighs or sees.
+          KeyError: if `info` lacks what the RN weighs or sees.
         """
         obs, real_reward, terminated, truncated, info = self.env.step(action)
         real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
-        ends = terminated or (truncated and self.limit_is_terminal)
-        reward = bonus = self._bonus(obs, self._told(info), ends)
+        told = np.array([info[key] for key in self._info_keys], np.float32)
+        reward = bonus = self._bonus(obs, told, terminated)
         if self.config.shaping.is_additive:
             reward += real_reward
         if not (np.isfinite(reward) and abs(bonus) < MAX_ABS_VALUE):
@@ -131,35 +116,22 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         outputs = networks.forward(self._layers, self.config.activation, x)
         return self.config.output_scale * outputs[..., 0]
 
-    def _bonus(self, obs: Any, told: np.ndarray, ends: bool) -> float:
+    def _bonus(self, obs: Any, told: np.ndarray, terminated: bool) -> float:
         """What a transition is worth beside the real reward."""
         if self._weights is not None:
             return float(self._weights @ told)
         before, self._potential = self._potential, self.potential(obs, told)
-        after = 0.0 if ends and self.config.zero_at_terminal else self._potential
+        after = 0.0 if terminated and self.config.zero_at_terminal else self._potential
         return self.discount * after - before if self.config.shaping.is_potential_based else after
 
-    def _told(self, info: Info) -> np.ndarray:
-        """The entries of a step's `info` that the RN weighs or sees, `[info_keys]`."""
-        missing = [key for key in self._info_keys if key not in info]
-        if missing:
-            fix = "Set RewardNetwork(..., info_keys=[...])."
-            raise ConfigError(f"env must tell {missing} in info; got {[*info]}. {fix}", "env")
-        return np.array([info[key] for key in self._info_keys], np.float32)
-
-    def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
-        """Entries of `info` that the RN needs."""
+    def _keys(self, header: Header) -> list[str]:
+        """Entries of `info` that the RN needs, of which the configuration of its task tells."""
         weighs_info = self.config.shaping.weighs_info
         if not (weighs_info or self.config.augmented):
-            return ()
-        name = "info_keys" if weighs_info else "augmented_keys"
-        keys = given or ()
-        if not given and task in GYMNASIUM_IDS:
-            stated = getattr(registry.configure("env", {"name": task}).spec, name)
-            keys = [GYMNASIUM_NAMES.get(key, key) for key in stated]
-        got = f"{shortened(task)}, whose info is not known here"
-        require(keys, "info_keys", f"must be `sejax.Task.{name}`; got none for {got}.")
-        return tuple(keys)
+            return []
+        spec = envs.spec_of(configured("env", header.config["env"], header.task))
+        keys = spec.info_keys if weighs_info else spec.augmented_keys
+        return [GYMNASIUM_NAMES.get(key, key) for key in keys]
 
 
 def _require_task(env: Env, header: Header) -> None:
@@ -168,24 +140,19 @@ def _require_task(env: Env, header: Header) -> None:
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
-    obs_kind = _kind(learned.observation_space)
-    is_as_it_is = _kind(layers[-1].observation_space) == obs_kind  # made so by no wrapper
-    changed = [x for x in layers if is_as_it_is and isinstance(x, ObservationWrapper)]
-    changed = [x for x in changed if not isinstance(x, SAME_NUMBERS)]
+    seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
     # Wrappers may make actions of one kind of another: some layer has the task's.
-    action_kinds = {_kind(layer.action_space) for layer in layers}
-    is_seen = _kind(env.observation_space) == obs_kind
-    for holds, must, got in (
-        (not isinstance(env.unwrapped, CliffWalkingEnv), "sejax's actions and falls", env),
-        (is_seen, f"the observations {learned.observation_space}", env.observation_space),
-        (action_kinds & {_kind(learned.action_space), None}, "its actions", env.action_space),
-        (not changed, "observations that no wrapper below has changed", changed[:1]),
-    ):
-        message = f"must be of {shortened(header.task)}, with {must}; got {shortened(got)}."
-        require(holds, "env", message)
+    action_kinds = [_kind(layer.action_space) for layer in layers]
+    must = f"must be sejax's {shortened(header.task, 40)}, its observations changed by no wrapper"
+    is_same = (
+        not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, whose rules are others
+        and _kind(env.observation_space) == _kind(learned.observation_space)
+        and _kind(learned.action_space) in action_kinds
+        and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
+    )
+    require(is_same, "env", f"{must}; got {shortened(env)}.")
 
 
-def _kind(space: Space[Any]) -> tuple[bool, int] | None:
-    """What must be equal for two spaces to be of one task; None for one that is not known."""
-    is_known = isinstance(space, Box | Discrete)
-    return (isinstance(space, Box), flatdim(space)) if is_known else None
+def _kind(space: Space[Any]) -> tuple[type, int]:
+    """What must be equal for two spaces to be of one task."""
+    return type(space), flatdim(space)

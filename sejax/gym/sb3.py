@@ -3,7 +3,6 @@
 from functools import partial
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
@@ -18,8 +17,7 @@ class SyntheticVecEnv(DummyVecEnv):
     `infos[i]["TimeLimit.truncated"]` says whether it was merely cut. Environment i is that of
     `sejax.gym.make` after `reset(seed=seed + i)`.
 
-    `get_attr`, `set_attr` and `env_method` ask environments that take no steps: they have the
-    spaces, the configuration and what is set there, and no state.
+    `get_attr`, `set_attr` and `env_method` ask environments that take no steps.
 
     Args:
       world: of the SE.
@@ -28,25 +26,25 @@ class SyntheticVecEnv(DummyVecEnv):
 
     def __init__(self, world: SyntheticWorld, num_envs: int):
         super().__init__([partial(SyntheticEnv, world)] * num_envs)
-        self._episodes = SyntheticVectorEnv(world, num_envs, AutoresetMode.DISABLED)
+        self._episodes = SyntheticVectorEnv(world, num_envs)
 
     def reset(self) -> np.ndarray:
         """First observations, `[num_envs, ...]`, with the seeds of the last call of `seed`."""
-        obs, _ = self._episodes.reset(seed=self._seeds)
+        obs, _ = self._episodes.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()  # which have no effect
         return obs
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:  # type: ignore[override]
         """Observations, rewards and ends, `[num_envs, ...]`, and an info for each environment."""
-        obs, rewards, terminated, truncated, told = self._episodes.step(self.actions)
+        rewards, terminated, truncated, discounts = self._episodes.advance(self.actions)
         dones, cut = terminated | truncated, truncated & ~terminated
         infos: list[Info] = [
             {"discount": discount, "TimeLimit.truncated": is_cut}
-            for discount, is_cut in zip(told["discount"].tolist(), cut.tolist(), strict=True)
+            for discount, is_cut in zip(discounts.tolist(), cut.tolist(), strict=True)
         ]
-        if dones.any():
-            for i in np.flatnonzero(dones):
-                infos[i]["terminal_observation"] = obs[i]
-            obs, _ = self._episodes.reset(options={"reset_mask": dones})
-        return obs, rewards.astype(np.float32), dones, infos
+        last = self._episodes.observe()
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = last[i]
+        self._episodes.begin(dones)
+        return self._episodes.observe(), rewards.astype(np.float32), dones, infos

@@ -1,7 +1,7 @@
 """Synthetic environments (SEs) in NumPy: the world that one is, and one episode in it at a time."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -24,7 +24,6 @@ from sejax.proxies.synthetic import SyntheticConfig
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
 LIMIT = np.float32(MAX_ABS_VALUE)
-Numbers = np.ndarray | float
 
 
 class SyntheticWorld:
@@ -102,20 +101,17 @@ class SyntheticWorld:
         Raises:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
-        if isinstance(space, spaces.Discrete):
-            if space.contains(action):
-                return self._one_hot[int(action)]
-        elif isinstance(self.action_space, spaces.Discrete):
-            array = np.asarray(action)  # also of bools, which would be a mask
-            if array.dtype.kind in "biu" and space.contains(array):
-                return self._one_hot[array.astype(np.intp)]
+        if isinstance(self.action_space, spaces.Discrete):
+            array = np.asarray(action)
+            if array.dtype.kind in "iu" and space.contains(action):
+                return self._one_hot[array]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
         raise InvalidAction(f"{action!r} is none of {space}")
 
     def step(
-        self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
+        self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None
     ) -> tuple[np.ndarray, Any, Any, Any, Any]:
         """One step of each episode.
 
@@ -202,7 +198,6 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def __init__(self, world: SyntheticWorld):
         self.world = world
-        self.config = world.config
         self.observation_space = world.observation_space
         self.action_space = copy.deepcopy(world.action_space)  # its sampler is this one's
         self._vector: np.ndarray | None = None  # [obs_dim]: what the networks see and predict
@@ -246,8 +241,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
       world: of the SE.
       num_envs: number of environments.
       autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
-        SameStep (the end's step returns the next episode's first observation, and the last one's
-        own as `infos["final_obs"]`), or Disabled (`reset(options={"reset_mask": ended})`).
+        or SameStep (the end's step returns the next episode's first observation, and the last
+        one's own as `infos["final_obs"]`).
     """
 
     def __init__(
@@ -256,9 +251,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self.world = world
         self.num_envs = num_envs
         mode = getattr(autoreset_mode, "value", autoreset_mode)
-        one_of([x.value for x in AutoresetMode])("autoreset_mode", mode, None)
-        self.autoreset_mode = AutoresetMode(mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        one_of(["NextStep", "SameStep"])("autoreset_mode", mode, None)
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode(mode)}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space
         self.observation_space = batch_space(world.observation_space, num_envs)
@@ -266,40 +260,28 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._vectors = np.zeros((num_envs, world.obs_dim), np.float32)
         self._times = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
-        # Of each environment, as in Gymnasium's own; None before the first reset.
-        self._np_random: list[Any] = [None] * num_envs  # type: ignore[assignment]
-        self._np_random_seed: list[int | None] = [None] * num_envs  # type: ignore[assignment]
+        self._generators: list[np.random.Generator] = []  # from the first reset on
         # A generator gives the same numbers one by one and all at once, which is quicker.
         num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
         self._num_used = np.full(num_envs, num_drawn)  # of those
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+        self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
         """Begins an episode in each environment.
 
         Args:
-          seed: of the first environment, and the next ones have the numbers that follow; or a seed
-            for each.
-          options: `reset_mask`, `[num_envs]` of bool: only these environments.
-
-        Raises:
-          ConfigError: for seeds or a mask of another length.
+          seed: of the first environment; the next ones have the numbers that follow.
+          options: have no effect.
         """
-        n, seeds = self.num_envs, seed
-        if seeds is None or isinstance(seeds, int | np.integer):
-            seeds = [None if seeds is None else int(seeds) + i for i in range(n)]
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(n, np.bool_)))
-        require(len(seeds) == n, "seed", f"must be one number, or {n}; got {len(seeds)}.")
-        got, wanted = f"{mask.dtype}{list(mask.shape)}", f"bool[{n}]"
-        require(got == wanted, "options.reset_mask", f"must be {wanted}; got {got}.")
-        for i in np.flatnonzero(mask).tolist():
-            if self._np_random[i] is None or seeds[i] is not None:
-                self._np_random[i], self._np_random_seed[i] = seeding.np_random(seeds[i])
-                self._num_used[i] = self._drawn.shape[1]  # what it had drawn before is void
-        self._begin(mask)
-        return self.world.observe(self._vectors), {}
+        if seed is not None or not self._generators:
+            seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
+            self._generators = [seeding.np_random(number)[0] for number in seeds]
+            self._num_used[:] = self._drawn.shape[1]  # what they had drawn before is void
+        self._ended = np.zeros(self.num_envs, np.bool_)
+        self.begin(~self._ended)
+        return self.observe(), {}
 
     def step(
         self, actions: ArrayLike
@@ -307,49 +289,66 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         """One step of each environment.
 
         Raises:
-          gymnasium.error.ResetNeeded: if an environment has no episode that goes on.
+          gymnasium.error.ResetNeeded: before the first reset.
           gymnasium.error.InvalidAction: for actions that are none of the space's.
         """
-        begins_itself = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        if None in self._np_random or (self._ended.any() and not begins_itself):
+        on = ~self._ended  # the others begin an episode
+        rewards, terminated, truncated, discounts = self.advance(actions)
+        self.begin(self._ended)
+        ended = terminated | truncated
+        infos = _told(discounts, on)
+        if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+            self._ended = ended
+        elif ended.any():
+            obs, final_obs = self.observe(), np.full(self.num_envs, None)
+            for i in np.flatnonzero(ended):
+                final_obs[i] = obs[i]
+            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
+            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
+            self.begin(ended)
+        return self.observe(), rewards, terminated, truncated, infos
+
+    def observe(self) -> np.ndarray:
+        """What agents see of all states, `[num_envs, ...]`, a copy."""
+        return np.asarray(self.world.observe(self._vectors))
+
+    def advance(self, actions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """One step of the environments whose episodes have not ended; begins none.
+
+        Returns:
+          `(rewards, terminated, truncated, discounts)`, `[num_envs]` each.
+
+        Raises:
+          gymnasium.error.ResetNeeded, gymnasium.error.InvalidAction: as `step`.
+        """
+        if not self._generators:
             raise ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
-        on = ~self._ended  # the others begin an episode
+        on = ~self._ended
         rewards, discounts = np.zeros((2, self.num_envs))
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
         if on.any():
             self._times += on
             chances = None
             if self.world.draws_ends:
-                chances = np.array([self._np_random[i].random() for i in np.flatnonzero(on)])
+                chances = np.array([self._generators[i].random() for i in np.flatnonzero(on)])
             self._vectors[on], rewards[on], terminated[on], truncated[on], discounts[on] = (
                 self.world.step(self._vectors[on], encoded[on], self._times[on], chances)
             )
-        self._begin(self._ended)
-        self._ended = ended = terminated | truncated
-        infos = _told(discounts, on)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            obs, final_obs = self.world.observe(self._vectors), np.full(self.num_envs, None)
-            for i in np.flatnonzero(ended):
-                final_obs[i] = obs[i]
-            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
-            self._begin(ended)
-        return self.world.observe(self._vectors), rewards, terminated, truncated, infos
+        return rewards, terminated, truncated, discounts
 
-    def _begin(self, mask: np.ndarray) -> None:
+    def begin(self, mask: np.ndarray) -> None:
         """Puts environments at the beginning of an episode."""
         indices = np.flatnonzero(mask)
         num_drawn = self._drawn.shape[1]
         if not indices.size:
             return
         for i in indices[self._num_used[indices] == num_drawn]:
-            self._drawn[i] = self.world.draw(self._np_random[i], num_drawn)
+            self._drawn[i] = self.world.draw(self._generators[i], num_drawn)
             self._num_used[i] = 0
         self._vectors[indices] = self.world.first(self._drawn[indices, self._num_used[indices]])
         self._num_used += mask
         self._times *= ~mask
-        self._ended = self._ended & ~mask
 
 
 def _told(discounts: np.ndarray, mask: np.ndarray) -> Info:

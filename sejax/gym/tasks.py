@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeLimit
 
 from sejax import envs
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
-from sejax.options import ConfigError, registry, require, shortened, told
+from sejax.options import ConfigError, registry, require, shortened
 from sejax.options.plain import to_plain
 from sejax.proxies.header import Header, is_same_space
 from sejax.proxies.synthetic import SyntheticConfig
@@ -69,9 +69,12 @@ class RealTask:
           max_steps: replaces Gymnasium's limit.
 
         Raises:
-          ConfigError: if Gymnasium cannot make it, or has no limit for it and none is given.
+          ConfigError: if Gymnasium has no limit for it and none is given.
+          gymnasium.error.Error: if Gymnasium cannot make it.
         """
-        return cls.of_env(make_gymnasium(env_id, max_episode_steps=max_steps))
+        return cls.of_env(
+            gymnasium.make(env_id, max_episode_steps=max_steps, disable_env_checker=True)
+        )
 
     @classmethod
     def of_spec(cls, spec: TaskSpec) -> "RealTask":
@@ -102,34 +105,16 @@ def _first_observation(env: Env, rng: np.random.Generator) -> Any:
     return env.reset()[0]
 
 
-def make_gymnasium(env_id: str, **options: Any) -> Env:
-    """An environment of Gymnasium's registry.
-
-    Args:
-      env_id: such as `"CartPole-v1"`.
-      **options: of `gymnasium.make`, and of the environment.
-
-    Raises:
-      ConfigError: if Gymnasium cannot make it.
-    """
-    try:
-        return gymnasium.make(env_id, disable_env_checker=True, **options)
-    except (gymnasium.error.Error, ImportError) as error:
-        message = f"task must be one that Gymnasium can make here; {env_id} raised {told(error)}."
-        raise ConfigError(message, "task") from error
-
-
-def real_env(header: Header, fix: str, **options: Any) -> Env:
+def real_env(header: Header, **options: Any) -> Env:
     """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same.
 
     Args:
       header: of the file.
-      fix: what to type where it has none.
       **options: of `gymnasium.make`, such as `render_mode`.
 
     Raises:
-      ConfigError: if there is none, for an option that the task does not have here, or if Gymnasium
-        cannot make it.
+      ConfigError: if there is none, or for an option that the task does not have here.
+      gymnasium.error.Error: if Gymnasium cannot make it.
     """
     config, limit = header.config["env"], header.spec.max_steps
     name = str(config.get("name"))
@@ -137,15 +122,13 @@ def real_env(header: Header, fix: str, **options: Any) -> Env:
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
-    require(
-        is_known and fields.pop("backend", "mujoco") in GYMNASIUM_BACKENDS,
-        "task",
-        f"must be given, because Gymnasium has none that is the same; got {shortened(config)}. Set "
-        f"{fix}, or an id of Gymnasium.",
-    )
+    is_known &= fields.pop("backend", "mujoco") in GYMNASIUM_BACKENDS
+    must = "must be given, because Gymnasium has none that is the same"
+    fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
+    require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")
     if name in GRIDS:
         return TimeLimit(GridWorld(name, **fields), limit)
-    return make_gymnasium(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
+    return gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 
 
 def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None) -> RealTask:
@@ -165,28 +148,15 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     if task is None:
         if not config.needs_task:
             return learned
-        # Episodes begin where those of Gymnasium's task of that id do, whatever gymnax's steps are.
-        gymnax_id = str(header.config["env"].get("name")).partition("gymnax/")[2]
-        is_known = gymnax_id in gymnasium.registry
-        fix = "task=sejax.gym.RealTask(...)"
-        task = gymnax_id if is_known else RealTask.of_env(real_env(header, fix))
+        task = RealTask.of_env(real_env(header, disable_env_checker=True))
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task, limit)
-    require(
-        isinstance(task, RealTask),
-        "task",
-        f"must be a RealTask or an id of Gymnasium; got {shortened(task)}. Set "
-        "task=sejax.gym.RealTask.of_env(env).",
-    )
     action = space_of(task.action_space, "task.action_space")
-    require(
-        is_same_space(action, header.spec.action)
-        and config.max_steps(task.max_steps) == config.max_steps(limit),
-        "task",
-        f"must have the actions and the step limit of the SE's task, {learned.action_space} and "
-        f"{limit}; got {shortened(task.action_space)} and {task.max_steps}. Set max_steps={limit}, "
-        "or wrap it in gymnasium.wrappers.RescaleAction.",
-    )
+    is_same = config.max_steps(task.max_steps) == config.max_steps(limit)
+    is_same &= bool(is_same_space(action, header.spec.action))
+    must = f"must have the SE's actions, {learned.action_space}, and its step limit, {limit}"
+    got = f"got {shortened(task.action_space)} and {task.max_steps}"
+    require(is_same, "task", f"{must}; {got}. Set max_steps, or wrap it in RescaleAction.")
     return task
 
 
@@ -206,7 +176,7 @@ class GridWorld(gymnasium.Env[int, int]):
 
     Args:
       name: cliff_walking or gridworld_2x2.
-      goal_reward: of the move into the goal, if not the task's usual one.
+      **options: fields of the task's configuration, such as `goal_reward`.
 
     Example:
       >>> env = GridWorld("gridworld_2x2")
@@ -216,16 +186,15 @@ class GridWorld(gymnasium.Env[int, int]):
       (2, -0.01, False, False, {})
     """
 
-    def __init__(self, name: str, goal_reward: float | None = None):
-        task = envs.make(name)
+    def __init__(self, name: str, **options: Any):
+        task = envs.make(name, **options)
         self._world: Any = task.env
-        params: Any = task.params
-        self._params = params if goal_reward is None else params.replace(goal_reward=goal_reward)
+        self._params: Any = task.params
         self._index: int | None = None
         self.observation_space = spaces.Discrete(task.obs_dim)
         self.action_space = spaces.Discrete(task.action_dim)
-        arguments = {"name": name, "goal_reward": goal_reward}
-        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=arguments)
+        kwargs = {"name": name, **options}
+        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=kwargs)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
         """Puts the agent on the map's S; `options` has no effect."""

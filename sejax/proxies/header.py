@@ -27,7 +27,7 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 # and the words of a command.
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
-_KIND = "sejax"  # of the metadata's entry
+KIND = "sejax"  # of the metadata's entry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,14 +132,13 @@ def is_registered(group: str, stored: object) -> bool:
     return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
 
 
-def configured(group: str, values: object, where: str, option: str = "") -> Any:
+def configured(group: str, values: object, where: str) -> Any:
     """The configuration of a group that a file holds as plain values.
 
     Args:
       group: such as `agent`.
       values: of the file.
       where: the file, for messages.
-      option: name of the argument that named the file, for messages; none if it is empty.
 
     Raises:
       ConfigError: if they are none, or of a name that is not registered.
@@ -148,10 +147,10 @@ def configured(group: str, values: object, where: str, option: str = "") -> Any:
         return registry.configure(group, values)  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field = PLUGIN_ARGUMENTS.get(group, group)
-    words = f", or {PLUGIN_WORDS[group]}=MODULE:NAME in a command" if option else ""
-    must = f"must have a registered {group}, because what a file names is never imported"
-    got = f"got {shortened(name, 40)} in {shortened(where, 40)}"
-    raise ConfigError(f"{option or field} {must}; {got}. Set {field}=...{words}.", field)
+    word = PLUGIN_WORDS.get(group, group)
+    must = f"must be registered for {shortened(where, 40)}, as what a file names is never imported"
+    fix = f"Set {field}=..., or {word}=MODULE:NAME in a command"
+    raise ConfigError(f"{field} {must}; got {shortened(name, 40)}. {fix}.", field)
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -209,7 +208,7 @@ def read(
     path = find(source, option)
     where = shortened(path, 60)
     try:
-        tensors, plain = checksummed.read(path, _KIND)
+        tensors, plain = checksummed.read(path, KIND)
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         got = f"got {where} ({shortened(error, 60)})"
@@ -221,24 +220,6 @@ def read(
     got = f"got a set in {where}. sejax.load_set reads sets"
     require(is_one, option, f"must be a single proxy; {got}.")
     return Stored(path, tensors, header)
-
-
-def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
-    """The configuration that the proxies of a file were learned with, nested plain values.
-
-    Raises:
-      ConfigError: as `read`.
-    """
-    return read(source, option).header.config
-
-
-def packed(tensors: dict[str, np.ndarray], header: Header) -> bytes:
-    """The content of a file.
-
-    Raises:
-      TypeError or ValueError: if the header's values are not plain.
-    """
-    return checksummed.pack(tensors, _KIND, vars(header))
 
 
 def check_tensors(

@@ -20,9 +20,9 @@ from sejax.agents.base import AgentConfig
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.spec import TaskSpec
+from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, shortened, told, unknown_name
-from sejax.options.parts import require_part
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
@@ -48,13 +48,7 @@ class _Loaded:
 
     @property
     def task(self) -> Task:
-        """The real task.
-
-        Raises:
-          ConfigError: if it cannot be made here, and the file told what the proxy needs of it.
-        """
-        if isinstance(self.env.task.env, AbsentEnv):
-            self.env.task.env.reset_env()
+        """The real task; its spaces alone, if it cannot be made here and an SE needs no more."""
         return self.env.task
 
     def learned_with(self, group: str) -> Any:
@@ -63,15 +57,13 @@ class _Loaded:
         `sejax.training_of` reads its training.
 
         Raises:
-          ConfigError: for a group of another name; or if the file does not tell it, or names one
-            that is not registered, because a file's names are never imported.
+          ConfigError: if the file does not tell it, or names one that is not registered, because a
+            file's names are never imported.
 
         Example:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        if group not in registry.GROUPS:
-            raise unknown_name("group", group, registry.GROUPS)
         agents = [*agents_of(self.config).values()]
         agent = agents[0] if len(agents) == 1 else None
         values = agent if group == "agent" else self.config.get(group)
@@ -347,8 +339,7 @@ def _write(
     require(is_known, "discount", must)
     stacked: dict[str, list[np.ndarray]] = {}
     for nested in weights:
-        flat = _flatten(nested) if isinstance(nested, Mapping) else {}
-        tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+        tensors = {name: np.asarray(x, np.float32) for name, x in _flatten(nested).items()}
         check_tensors("weights", tensors, _shapes_of(env), "params.weights")
         stacked = {name: [*stacked.get(name, []), x] for name, x in tensors.items()}
     if is_set:
@@ -366,7 +357,7 @@ def _write(
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
-        data = header.packed(tensors, stored)
+        data = checksummed.pack(tensors, header.KIND, vars(stored))
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         must = "must be plain values that sejax.load takes, with numbers for score and seed"
         fix = "Set config=sejax.config(...).plain()"
@@ -491,16 +482,13 @@ def _proxies_of(
 
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
-    for name, cls, part in (("task", Task, task), ("proxy", ProxyConfig, proxy)):
-        if part is not None:
-            require_part(name, cls, part, f"Leave it out for a registered {name}.")
     learned, where = stored.header, stored.path.name
     if proxy is None:
-        proxy = header.configured("proxy", learned.config["proxy"], where, option)
+        proxy = header.configured("proxy", learned.config["proxy"], where)
     real = task
     if real is None:
         try:
-            real = envs.make_from(header.configured("env", learned.config["env"], where, option))
+            real = envs.make_from(header.configured("env", learned.config["env"], where))
         except ConfigError as error:
             if proxy.needs_task:
                 raise
@@ -522,15 +510,14 @@ def _require_same(learned: Header, task: Task, proxy: ProxyConfig, where: str) -
     does not know the bounds of observations.
     """
     spec = learned.spec
-    same = {
-        "observation": is_same_space(spec.observation, task.observation, proxy.sees_bounds),
-        "action": is_same_space(spec.action, task.action),
-        "max_steps": spec.max_steps == task.max_steps or proxy.has_real_dynamics,
-    }
-    for name, is_same in same.items():
-        must = f"must have the {name} {shortened(learned.interface[name], 60)}"
-        got = f"of {shortened(where, 40)}; got {shortened(task.interface[name], 60)}"
-        require(is_same, "task", f"{must} {got}.")
+    is_same = (
+        is_same_space(spec.observation, task.observation, proxy.sees_bounds)
+        and is_same_space(spec.action, task.action)
+        and (spec.max_steps == task.max_steps or proxy.has_real_dynamics)
+    )
+    must = f"must have {spec.max_steps} steps, as {shortened(where, 40)}, and the same spaces"
+    wanted, got = (shortened(x, 70) for x in (learned.interface, task.interface))
+    require(is_same, "task", f"{must}, {wanted}; got {task.max_steps} steps, {got}.")
 
 
 # --- a task that cannot be made here --------------------------------------------------------------

@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from sejax.options import as_text, is_number, require, shortened
+import yaml
+
+from sejax.options import require, shortened
 from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
@@ -73,7 +75,6 @@ class PretrainedProxy:
       kind: se, rn, or the name of another configuration.
       task: name of the task that it stands in for.
       settings: the proxy's configuration, plain values.
-      size_kb: size of the file in units of 1,000 bytes.
       scores: mean score of the incumbent with each agent that it was learned with, in the
         generation that the proxy is of; for an SE a test return. Empty if it was not recorded.
       objective: name of the objective that the scores are of; "" if it was not recorded.
@@ -88,7 +89,6 @@ class PretrainedProxy:
     kind: str
     task: str
     settings: dict[str, Any]
-    size_kb: float
     scores: dict[str, float] = field(default_factory=dict)
     objective: str = ""
     generation: int | None = None
@@ -103,11 +103,6 @@ class PretrainedProxy:
         return self.policy_return is not None
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """The agents that it was learned with."""
-        return tuple(self.scores)
-
-    @property
     def on_proxy(self) -> tuple[Evaluation, ...]:
         """The evaluations of agents that trained on it, and not on the real task."""
         return tuple(x for x in self.evaluations if x.world == "proxy")
@@ -117,34 +112,8 @@ class PretrainedProxy:
         """The model card, in Markdown."""
         return card_of(self, self.name)
 
-    @property
-    def row(self) -> dict[str, str]:
-        """The cells of a table of proxies, by the names of their columns."""
-        learning = self.learning
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "task": self.task,
-            "learned with": "a policy" if self.is_distilled else ", ".join(self.agents),
-            "tested with": ", ".join(dict.fromkeys(each.agent for each in self.on_proxy)),
-            "return": spread([each.return_mean for each in self.on_proxy], ".1f"),
-            "steps": spread([each.train_steps for each in self.on_proxy], ",.0f"),
-            "CPU s": f"{learning.cpu_s:,.0f}" if learning and learning.cpu_s else "",
-            "real steps": f"{learning.real_steps:,}" if learning else "",
-            "kB": f"{self.size_kb:.1f}",
-        }
 
-
-class Zoo(tuple[PretrainedProxy, ...]):
-    """Proxies, which print as a table."""
-
-    def __repr__(self) -> str:
-        table = [[*self[0].row], *([*proxy.row.values()] for proxy in self)] if self else []
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        return "\n".join("  ".join(map(str.ljust, cells, widths)).rstrip() for cells in table)
-
-
-def pretrained() -> Zoo:
+def pretrained() -> tuple[PretrainedProxy, ...]:
     """The proxies that ship with the package, by name; `sejax.load(name)` loads one.
 
     Example:
@@ -152,7 +121,7 @@ def pretrained() -> Zoo:
       ['acrobot', 'acrobot-distilled']
     """
     files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
-    return Zoo(describe(header.read(file, single=True)) for file in files)
+    return tuple(describe(header.read(file, single=True)) for file in files)
 
 
 def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
@@ -178,22 +147,12 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
         "kind": learned.kind,
         "task": learned.task,
         "settings": config["proxy"],
-        "size_kb": path.stat().st_size / 1000,
         "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
     }
     return from_plain(PretrainedProxy, values, "record")
 
 
-def spread(values: Sequence[float], spec: str) -> str:
-    """The lowest and the highest of some numbers; nothing if there are none.
-
-    Example:
-      >>> spread([199.5, 180.0], ".1f"), spread([4000.0, 4000.2], ",.0f")
-      ('180.0 to 199.5', '4,000')
-    """
-    ends = (min(values), max(values)) if values else ()
-    return " to ".join(dict.fromkeys(format(end, spec) for end in ends))
-
+FACTS = ("settings", "scores", "objective", "generation", "seed", "learning", "policy_return")
 
 # --- model cards ----------------------------------------------------------------------------------
 
@@ -202,11 +161,6 @@ _ROW = (  # of an evaluation
     "| {0.agent} | {0.hparams} | {0.world} | {0.return_mean:.1f} ± {0.return_std:.1f} | "
     "{0.train_steps:,.0f} | {0.num_agents} |"
 )
-_BEST = {  # overrides of `sejax.evaluate` that train agents again as they were
-    "default": " agent={}",
-    "varied": " agent={} agent_hparams=varied",
-    "as_learned": " agent_hparams=as_learned",
-}
 
 
 def card_of(
@@ -225,50 +179,32 @@ def card_of(
     call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
+    if best and best.hparams != "as_learned":
+        words += f" agent={best.agent}"
+    if best and best.hparams != "default":
+        words += f" agent_hparams={best.hparams}"
     tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
+    plain = to_plain(proxy)
+    if proxy.learning:
+        plain["learning"].pop("command")  # which the card has below
+    facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
         "front": json.dumps(license) if hub.is_address(source) else None,
         "tags": json.dumps(tags),
         **{name: "" if name == kind else None for name in _KINDS},
-        "facts": table([{"field": name, "value": text} for name, text in _facts(proxy).items()]),
+        "facts": yaml.safe_dump(facts, sort_keys=False).rstrip(),
         "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
         "command": proxy.learning and proxy.learning.command,
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
         "gym": _GYM.format(call) if kind == "se" else "",
         "call": call,
         "source": source,
-        "overrides": words + (_BEST[best.hparams].format(best.agent) if best else ""),
+        "overrides": words,
         "license": license or SHIPPED_LICENSE,
     }
     parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
     kept = [x for x in parts if None not in map(values.get, re.findall(r"\{(\w+)\}", x))]
     return "\n\n".join(kept).format(**values)
-
-
-def table(rows: Sequence[Mapping[str, str]]) -> str:
-    """A table in Markdown, of rows by the names of their columns."""
-    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _facts(proxy: PretrainedProxy) -> dict[str, str]:
-    """What is known of a proxy, by field: its settings, its scores, and what it cost."""
-    elsewhere = ("name", "kind", "task", "size_kb", "evaluations")
-    plain = {name: x for name, x in to_plain(proxy).items() if name not in elsewhere}
-    if proxy.learning:
-        plain["learning"].pop("command")
-    texts = {name: _text(value) for name, value in plain.items()}
-    return {name: text for name, text in texts.items() if text}
-
-
-def _text(value: object) -> str:
-    """A plain value on one line; nothing for None."""
-    if isinstance(value, Mapping):
-        texts = {name: _text(inner) for name, inner in value.items()}
-        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
-    if is_number(value):
-        return f"{value:,.5g}" if isinstance(value, float) else f"{value:,}"
-    return "" if value is None else as_text(value)
 
 
 # --- sharing --------------------------------------------------------------------------------------
@@ -280,7 +216,6 @@ def push(
     *,
     private: bool = False,
     license: str = "apache-2.0",
-    message: str = "A proxy of sejax",
 ) -> str:
     """Puts a proxy on the Hugging Face Hub, from where `sejax.load("hf://USER/REPO")` loads it.
 
@@ -292,7 +227,6 @@ def push(
       repo: `USER/REPO`; made if it is not there.
       private: whether a new repository is private.
       license: name by which the Hub knows it; that of the shipped proxies if not given.
-      message: message of the commit.
 
     Returns:
       Its address, which `sejax.load` takes.
@@ -306,5 +240,5 @@ def push(
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
     files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
-    hub.upload(repo, files, message, private)
+    hub.upload(repo, files, "A proxy of sejax", private)
     return address

@@ -87,7 +87,7 @@ def _load(config: EvaluateConfig) -> Proxy:
       ConfigError: if it cannot be loaded, or `env` is not its task.
     """
     path = header.find(config.proxy, "proxy", also=("real",))
-    stored = header.read_config(path, "proxy")
+    stored = header.read(path, "proxy").header.config
     task = proxy_config = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
