@@ -109,7 +109,9 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     program, _, ((states, infos), (others, _)) = one_device
     assert len({float(info.population_mean) for info in infos}) == 3
     assert program.strategy.num_evaluations == 12  # 4 members with two signs, 4 incumbents
-    groups = [keys for state in (states[0], states[1], others[0]) for keys in program.ask(state).keys]
+    groups = [
+        keys for state in (states[0], states[1], others[0]) for keys in program.ask(state).keys
+    ]
     data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in groups])
     assert len(np.unique(data, axis=0)) == len(data) == 3 * 12
 

@@ -6,7 +6,6 @@ import itertools
 import json
 import pickle
 import sys
-from pathlib import Path
 
 import gymnax
 import jax
