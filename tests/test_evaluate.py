@@ -83,14 +83,18 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
     assert is_drawn(tmp_path / "evaluation.png")
 
 
-def test_one_agent_has_no_deviation_and_a_live_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1", f"out_dir={tmp_path}"
-    evaluate(evaluate_config(*words))
-    printed = capsys.readouterr().out
-    assert "nan" not in printed and "1 fresh q_learning agents" in printed
-    table = pd.read_csv(tmp_path / "evaluation.csv")
-    assert set(table.world) == {"the real task"}  # which alone can be evaluated
+def test_one_agent_has_no_deviation_and_a_live_line_changes_no_number(
+    tmp_path, capsys, monkeypatch
+):
+    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1"
+    for folder in ("quiet", "live"):
+        evaluate(evaluate_config(*words, f"out_dir={tmp_path / folder}"))
+        printed = capsys.readouterr().out
+        assert "nan" not in printed and "1 fresh q_learning agents" in printed
+        monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
+    quiet, live = (tmp_path / folder / "evaluation.csv" for folder in ("quiet", "live"))
+    assert live.read_bytes() == quiet.read_bytes()
+    assert set(pd.read_csv(live).world) == {"the real task"}  # which alone can be evaluated
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
