@@ -31,14 +31,6 @@ def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
     assert cache_folder() is None
 
 
-@pytest.mark.parametrize(
-    ("words", "devices"),
-    [(["devices=3", "devices=2"], 2), (["devices=0"], None), (["devices=x"], None), ([], None)],
-)
-def test_devices_are_known_before_anything_is_composed(words, devices):
-    assert commands._devices(words) == devices
-
-
 def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, capsys, tmp_path):
     shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.chdir(tmp_path)

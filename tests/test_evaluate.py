@@ -22,7 +22,6 @@ from sejax.ops.checksummed import pack, unpack
 from sejax.options import registry
 from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
-from sejax.runs import plots
 from sejax.runs.worlds import proxy_setup
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -237,12 +236,3 @@ def test_pickling_an_agent_says_what_to_send_in_its_place():
     agent = sejax.make_agent(sejax.DDQNConfig(hidden_size=4), sejax.envs.make("cartpole"))
     with pytest.raises(TypeError, match="Send its configuration"):
         pickle.dumps(agent)
-
-
-def test_a_learning_curve_has_a_title_and_a_panel_for_each_number(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(plots, "_write", lambda figure, path: drawn.append(figure))
-    names = ("incumbent_mean", "incumbent_std", "population_mean", "population_max")
-    rows = [{"generation": i, "train_steps_mean": 5} | dict.fromkeys(names, 1.0) for i in range(2)]
-    plots.learning_curve(rows, None, tmp_path, "cartpole, SE, ddqn")
-    assert len(drawn[0].axes) == 2 and drawn[0].axes[0].get_title() == "cartpole, SE, ddqn"

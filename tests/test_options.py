@@ -82,13 +82,6 @@ def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
     options.check(foreign(), "mine")
 
 
-def test_options_are_frozen_and_given_by_keyword():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Config().size = 3
-    with pytest.raises(TypeError, match="positional"):
-        Config(3)
-
-
 # --- what is traced, and what is varied ----------------------------------------------------------
 
 

@@ -288,16 +288,6 @@ def test_the_same_parts_as_objects_are_the_same_program(own):
     assert program(by_objects) == program(sejax.make_learner(own))
 
 
-def test_a_task_that_says_no_discount_has_reward_networks(own):
-    env = registry.make("proxy", sejax.RewardConfig(hidden_size=2), own.task())
-    params, key = env.default_params, jax.random.key(0)
-    _, state = env.reset_env(key, params)
-    for hand, discount in ((0.0, 1.0), (2.0, 0.0)):  # the target ends the episode
-        world = state.world.replace(hand=jnp.full(2, hand), target=jnp.full(2, 2.0))
-        *_, info = env.step_env(key, state.replace(world=world), jnp.zeros(2), params)
-        assert info["discount"] == discount
-
-
 def test_parts_that_do_not_fit_are_refused(own):
     task, other = own.env.make(), own.env.make()
     parts = {"task": task, "agent": own.agent.make(task), "proxy": own.proxy.make(other)}
