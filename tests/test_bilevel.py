@@ -156,9 +156,9 @@ def assert_result_equals_run(result, program, states, infos, **tolerance):
     assert_close(result.score, last.best_score, **tolerance)
 
 
-def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(one_device):
-    program, _, ((states, infos), _) = one_device
-    result = jax.jit(make_learner(tiny("devices=2")))(KEYS[0])
+def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(room):
+    program, _, ((states, infos), _) = room
+    result = jax.jit(make_learner(tiny("devices=2", words=ROOM)))(KEYS[0])
     assert_result_equals_run(result, program, states, infos, rtol=0)
 
 

@@ -19,16 +19,8 @@ from support import ended, refusal, refused
 
 import sejax
 from sejax import __main__ as program
-from sejax.ops.files import cache_folder
 from sejax.options.plain import expanded
 from sejax.runs import commands, runtime
-
-
-def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
-    for name in ("SEJAX_CACHE_DIR", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as where nobody's home is known
-    assert cache_folder() is None
 
 
 def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, capsys, tmp_path):

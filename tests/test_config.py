@@ -215,11 +215,10 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
 
 @pytest.mark.parametrize(("override", "field"), [
     ("num_agents=3", "proxy"), ("proxy=real agent_hparams=as_learned", "agent_hparams"),
-    ("proxy=real training_from=config", "training_from"), ("proxy=cartpole agent=2", "agent"),
+    ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
     ("proxy=real env=cartpole training.max_steps=9", "training"),
-    ("proxy=cartpole agent_hparams=as_learned agent=ppo", "agent"),
-    ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,ppo]", "agents"),
-    ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole seed=-1", "seed"),
+    ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
+    ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
     ("proxy=cartpole agents=[ddqn,ppo] agents.ppo.weight=2", "agents.ppo.weight"),
 ])  # fmt: skip

@@ -46,11 +46,13 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
 
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_forward_equals_a_numpy_loop(activation, num_layers):
+def test_forward_of_one_input_or_a_batch_equals_a_numpy_loop(activation, num_layers):
     apply, params = network(4, 3, 5, num_layers, activation)
-    for x in np.random.default_rng(0).normal(size=(5, 4)) * 2:
-        expected = numpy_forward(params, x, activation, num_layers)
-        np.testing.assert_allclose(apply(params, np.float32(x)), expected, rtol=1e-5, atol=1e-6)
+    batch = np.random.default_rng(0).normal(size=(4, 5)) * 2  # [feature, batch]
+    columns = [numpy_forward(params, x, activation, num_layers) for x in batch.T]
+    expected = np.stack(columns, axis=1)
+    for inputs, outputs in ((batch, expected), (batch[:, 1], expected[:, 1])):
+        np.testing.assert_allclose(apply(params, np.float32(inputs)), outputs, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(("function", "cut", "error"), [(tanh, 8, 3.3e-7), (fast_tanh, 7, 1.4e-6)])
@@ -79,15 +81,11 @@ def test_rational_tanh_is_tanh_within_its_stated_error(function, cut, error):
     np.testing.assert_allclose(jax.grad(jax.grad(function))(0.5), -0.72686198, atol=1e-5)
 
 
-@pytest.mark.parametrize("layer_norm", [False, True])
-def test_a_feature_major_batch_equals_single_inputs(layer_norm):
-    apply, params = network(4, 3, 5, 2, "tanh", layer_norm=layer_norm)
+def test_layer_norm_of_a_feature_major_batch_equals_that_of_single_inputs():
+    apply, params = network(4, 3, 5, 2, "tanh", layer_norm=True)
     batch = np.float32(np.random.default_rng(3).normal(size=(4, 7)))  # [feature, batch]
-    together = np.asarray(apply(params, batch))
-    assert together.shape == (3, 7)
-    for column in range(7):
-        alone = apply(params, batch[:, column])
-        np.testing.assert_allclose(together[:, column], alone, rtol=1e-5, atol=1e-6)
+    alone = np.stack([apply(params, x) for x in batch.T], axis=1)
+    np.testing.assert_allclose(apply(params, batch), alone, rtol=1e-5, atol=1e-6)
 
 
 def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():

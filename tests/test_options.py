@@ -55,15 +55,10 @@ def test_a_value_that_breaks_its_rule_is_refused(field, values):
         assert f"group.{field}=" in str(error)  # how to mend it
 
 
-def test_two_whole_messages():
-    first = refusal(Config, decay=2, share=2, size=0)  # of the fields that break their rules
-    assert str(first) == (
-        "group.size must be a whole number from 1 to 2147483647, because it is a size; got 0. "
-        "Set group.size=4."
-    )
-    assert str(refusal(Config, kind="fency")) == (
-        "group.kind must be one of fancy, plain; got 'fency'. Did you mean group.kind=fancy?"
-    )
+def test_a_whole_message():
+    error = refusal(Config, decay=2, share=2, size=0)  # of the fields that break their rules
+    rule = "must be a whole number from 1 to 2147483647, because it is a size"
+    assert str(error) == f"group.size {rule}; got 0. Set group.size=4."
 
 
 @pytest.mark.parametrize(("field", "values"), [

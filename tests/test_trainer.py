@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
-from support import assert_close, paper_se, paper_training, refused
+from support import assert_close, assert_equal, paper_se, paper_training, refused
 
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
@@ -120,28 +120,21 @@ def test_training_equals_a_plain_python_loop(variant, scripted):
     np.testing.assert_array_equal(result.episode_ends, np.nan_to_num(expected))
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
-    assert result.eval_steps == 0
+    assert result.eval_steps == 0 and result.test_returns is None
 
 
 @pytest.mark.parametrize(("variant", "num_episodes"), [
     ("tested", 4),  # test returns -1, 0, 1, 2: the mean of the last two is 1.5
     ("watched", 5),  # the training's own returns are judged, flat from the first on
-    ("plateau", 5),
 ])  # fmt: skip
 def test_tests_between_episodes_are_recorded_and_decide_if_the_rule_asks_for_them(
     variant, num_episodes
 ):
     result = trainer(variant)(KEY, script([3] * 12, [1] * 12))
     unfinished = [np.nan] * (12 - num_episodes)
-    assert result.episodes == num_episodes
+    assert result.episodes == num_episodes and result.eval_steps == num_episodes * 3
     np.testing.assert_array_equal(result.returns, [3] * num_episodes + unfinished)
-    if variant == "plateau":
-        assert result.test_returns is None
-    else:
-        np.testing.assert_array_equal(
-            result.test_returns, [*range(-1, num_episodes - 1), *unfinished]
-        )
-        assert result.eval_steps == num_episodes * 3
+    np.testing.assert_array_equal(result.test_returns, [*range(-1, num_episodes - 1), *unfinished])
 
 
 def test_a_solved_training_that_is_tested_throughout_goes_on():
@@ -154,8 +147,7 @@ def test_a_solved_training_that_is_tested_throughout_goes_on():
 
 def test_a_step_budget_ends_training_within_an_episode():
     result = trainer("cut")(KEY, script([7] * 12, [4] * 12))
-    assert result.train_steps == 17
-    assert result.episodes == 4  # the fifth is not finished and has no return
+    assert (result.train_steps, result.episodes) == (17, 4)  # the fifth has no return
     np.testing.assert_array_equal(result.returns, [7] * 4 + [np.nan] * 8)
     assert result.agent_state.num_updates == 17 - 8
 
@@ -196,10 +188,9 @@ def test_the_replay_holds_what_happened_with_the_true_last_observations():
 
 
 def test_each_episode_starts_from_a_fresh_reset():
-    result = trainer("never")(KEY, script([0] * 12, [1] * 12))
-    batch = result.agent_state.batch
-    tags = {int(a) // WHO: float(tag) for a, tag in zip(batch.action, batch.obs[1], strict=True)}
-    assert len(tags) > 8 and len(set(tags.values())) == len(tags)
+    batch = trainer("never")(KEY, script([0] * 12, [1] * 12)).agent_state.batch
+    episodes = np.unique(batch.action // WHO)
+    assert 8 < len(episodes) == len(np.unique(batch.obs[1]))  # tags
 
 
 def test_a_time_limit_bootstraps_unless_it_is_asked_to_be_terminal():
@@ -340,36 +331,34 @@ def test_a_time_limit_is_never_terminal_in_an_se():
     """As programs; what they do on a real task is above."""
     env = paper_se(hidden_size=4).make(envs.make("cartpole"))
     agent = DDQN(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4), 4, 2).agent()
-    trainings = [training(stop_rule="never", time_limit_is_terminal=x) for x in (False, True)]
-    without, asked = (
-        re.sub("0x[0-9a-f]+", "", str(jax.make_jaxpr(train)(KEY, env.default_params)))
-        for train in (make_trainer(agent, env, config) for config in trainings)
-    )
-    assert without == asked
+    programs = set()
+    for is_terminal in (False, True):
+        train = make_trainer(agent, env, training(time_limit_is_terminal=is_terminal))
+        program = str(jax.make_jaxpr(train)(KEY, env.default_params))
+        programs.add(re.sub("0x[0-9a-f]+", "", program))
+    assert len(programs) == 1
 
 
 # --- the test on the real task -------------------------------------------------------------------
 
 
 def test_the_tester_equals_greedy_episodes_in_gymnasium():
-    task = envs.make("cartpole")
+    task, key = envs.make("cartpole"), jax.random.key(3)
     agent = DDQN(DDQNConfig(hidden_size=8, num_layers=1), 4, 2).agent()
     state = agent.init(jax.random.key(2), agent.hparams)
-    key = jax.random.key(3)
     returns, steps, _ = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)
-    assert returns.shape == (6,) and steps.shape == (6,)
-    reference = gymnasium.make("CartPole-v1").unwrapped
+    assert returns.shape == steps.shape == (6,)
+    reference = gymnasium.make("CartPole-v1", max_episode_steps=200)
     greedy = jax.jit(lambda obs: agent.act(key, state, obs, explore=False))
     for i, key_episode in enumerate(jax.random.split(key, 6)):
-        key_reset, _ = jax.random.split(key_episode)
-        obs, _ = task.env.reset_env(key_reset, task.params)
+        obs, _ = task.env.reset_env(jax.random.split(key_episode)[0], task.params)
         reference.reset(seed=0)
-        reference.state = np.array(obs, np.float64)
+        reference.unwrapped.state = np.array(obs, np.float64)
         total, num_steps, ended = 0.0, 0, False
         while not ended:
-            obs, reward, terminated, _, _ = reference.step(int(greedy(jnp.float32(obs))))
+            obs, reward, terminated, truncated, _ = reference.step(int(greedy(jnp.float32(obs))))
             total, num_steps = total + reward, num_steps + 1
-            ended = terminated or num_steps == 200
+            ended = terminated or truncated
         assert (returns[i], steps[i]) == (total, num_steps)
     assert len(set(np.asarray(steps).tolist())) > 1  # different initial states
 
@@ -413,34 +402,26 @@ def scripted_task(length):
 
 
 def scripted_state():
-    agent = scripted_agent()
-    return agent.begin_episode(agent.init(KEY, 0.0), 0)
+    return scripted_agent().init(KEY, 0.0).replace(episode=jnp.int32(0))
 
 
-def partly_scored(agent, num_episodes):
-    """Tests in which so many steps are scored as their params say."""
-    task = scripted_task(99)
-    return make_tester(agent, task, num_episodes, lambda env: PartlyScored(env, task.params))
-
-
-def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
+@pytest.mark.parametrize(("repeat", "scored_steps", "scored", "num_steps"), [
     # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in the last one.
-    test = jax.jit(partly_scored(scripted_agent(), 2))
-    for scored_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
-        tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(scored_steps)))
-        np.testing.assert_array_equal(tests.scored, [scored] * 2)
-        np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
-        np.testing.assert_array_equal(tests.num_steps, [played] * 2)
-    tests = test(KEY, scripted_state(), False, PartParams(scored_steps=jnp.int32(4)))
-    assert not tests.returns.any() and not tests.num_steps.any()  # do not begin
-
-
-def test_actions_are_repeated_beyond_the_tasks_limit_too():
-    # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
-    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
-    test = partly_scored(agent, 1)
-    tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(9)))
-    assert tests.num_steps == 9 and tests.returns == 2.5
+    (1, 3, 0.0, 4), (1, 4, 2.5, 4), (1, 6, 5.0, 6),
+    (3, 9, 5.0, 9),  # decisions of 3 and 1 steps, then of 3 and 2
+])  # fmt: skip
+def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored(
+    repeat, scored_steps, scored, num_steps
+):
+    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=repeat))
+    task = scripted_task(99)
+    test = jax.jit(make_tester(agent, task, 2, lambda env: PartlyScored(env, task.params)))
+    params = PartParams(scored_steps=jnp.int32(scored_steps))
+    tests = test(KEY, scripted_state(), True, params)
+    # Returns are of the task's own 4 steps.
+    assert_equal(tests, [np.full(2, number) for number in (2.5, num_steps, scored)])
+    not_begun = test(KEY, scripted_state(), False, params)
+    assert not not_begun.returns.any() and not not_begun.num_steps.any()
 
 
 def test_recorded_tests_are_the_tests():
@@ -480,8 +461,7 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     (lambda agent, task: make_trainer(task.env, agent), "agent"),
     (lambda agent, task: make_trainer(agent, (task.env, task.params)), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
-    (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, paper_training()),
-     "task"),
+    (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, training()), "task"),
     (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),
 ])  # fmt: skip
 def test_arguments_of_other_kinds_are_refused(make, field):
