@@ -58,19 +58,11 @@ def test_configure_and_describe_are_inverses(group, name):
     assert type(config) is registry.find(group, name)
 
 
-class Plain(nn.Module):
-    features: int = 8
-
-
-class Residual(Plain):
-    pass
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Torso(AgentConfig):
     """An agent's configuration that holds another dataclass, a number, a list and a function."""
 
-    torso: nn.Module = Plain()  # noqa: RUF009 (frozen)
+    torso: nn.Module = nn.Dense(8)  # noqa: RUF009 (frozen)
     rate: float = 1.0
     sizes: Any = (1, 2)
     act: Any = len
@@ -81,14 +73,14 @@ class Torso(AgentConfig):
 
 def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
     task = envs.make("cliff_walking")
-    assert sejax.make_agent(Torso(), task) is sejax.make_agent(Torso(torso=Plain(8)), task)
+    assert sejax.make_agent(Torso(), task) is sejax.make_agent(Torso(torso=nn.Dense(8)), task)
     unhashable = Torso(sizes=[1, 2])  # the same as itself alone
     first = registry.make("agent", unhashable, task)
     assert registry.make("agent", unhashable, task) is first
     assert registry.make("agent", unhashable, envs.make("gridworld_2x2")) is not first
     variants = [
-        {}, {"torso": Residual()}, {"torso": Plain(9)}, {"torso": nn.Dense(3, dtype=np.float32)},
-        {"torso": nn.Dense(3, dtype=jnp.float16)}, {"rate": 2.0}, {"act": sum}, {"sizes": [1, 2]},
+        {}, {"torso": nn.DenseGeneral(8)}, {"torso": nn.Dense(9)}, {"rate": 2.0}, {"act": sum},
+        {"torso": nn.Dense(8, dtype=jnp.float16)}, {"sizes": [1, 2]}, {"sizes": (1, 3)},
         {"sizes": np.arange(5000)},  # too long for its repr to tell it from another
     ]  # fmt: skip
     agents = {id(sejax.make_agent(Torso(**fields), task)) for fields in variants}

@@ -70,27 +70,21 @@ def stacked(scripts):
 
 
 def plain_training(returns, lengths, rule, min_steps=0):
-    """The paper's loop and stopping rules in plain Python: returns so far, steps, updates."""
-    history, steps, updates = [], 0, 0
-
-    def mean(values):
-        return sum(values) / len(values) if values else 0.0
-
+    """The paper's loop and stopping rules in plain Python: episodes, steps, updates."""
+    steps, updates = 0, 0
     for episode in range(MAX_EPISODES):
         length = min(lengths[episode], MAX_STEPS)
         steps += length
-        updates += length if episode >= INIT_EPISODES else 0
-        history.append(returns[episode])
-        if episode < INIT_EPISODES or steps < min_steps:
+        if episode < INIT_EPISODES:
             continue
-        newer = mean(history[-WINDOW:])
-        if rule == "solved" and newer >= SOLVED:
+        updates += length
+        history = returns[: episode + 1]
+        newer, older = np.mean(history[-WINDOW:]), np.mean(history[-2 * WINDOW : -WINDOW])
+        may_be_flat = rule == "plateau" and episode >= INIT_EPISODES + WINDOW
+        is_flat = may_be_flat and abs(newer - older) <= TOLERANCE * (abs(older) + 1e-9)
+        if steps >= min_steps and (is_flat or (rule == "solved" and newer >= SOLVED)):
             break
-        if rule == "plateau" and episode >= INIT_EPISODES + WINDOW:
-            older = mean(history[-2 * WINDOW : -WINDOW])
-            if abs(newer - older) <= TOLERANCE * (abs(older) + 1e-9):
-                break
-    return history, steps, updates
+    return episode + 1, steps, updates
 
 
 scripts = st.tuples(
@@ -108,16 +102,14 @@ scripts = st.tuples(
 @example(scripted=([2**n for n in range(12)], [1] * 12))  # never flat
 def test_training_equals_a_plain_python_loop(variant, scripted):
     returns, lengths = scripted
-    rule = VARIANTS[variant].stop_rule
-    history, steps, updates = plain_training(returns, lengths, rule, VARIANTS[variant].min_steps)
+    rule, min_steps = VARIANTS[variant].stop_rule, VARIANTS[variant].min_steps
+    num_episodes, steps, updates = plain_training(returns, lengths, rule, min_steps)
     result = trainer(variant)(KEY, script(returns, lengths))
-    assert result.train_steps == steps
-    assert result.episodes == len(history)
-    expected = np.full(MAX_EPISODES, np.nan)
-    expected[: len(history)] = history
-    np.testing.assert_array_equal(result.returns, expected)
-    expected[: len(history)] = np.cumsum(np.minimum(lengths, MAX_STEPS))[: len(history)]
-    np.testing.assert_array_equal(result.episode_ends, np.nan_to_num(expected))
+    assert (result.train_steps, result.episodes) == (steps, num_episodes)
+    unfinished = MAX_EPISODES - num_episodes
+    ends = np.cumsum(np.minimum(lengths, MAX_STEPS))[:num_episodes]
+    np.testing.assert_array_equal(result.returns, returns[:num_episodes] + [np.nan] * unfinished)
+    np.testing.assert_array_equal(result.episode_ends, [*ends, *[0] * unfinished])
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
     assert result.eval_steps == 0 and result.test_returns is None
