@@ -4,24 +4,22 @@ import dataclasses
 import functools
 import itertools
 import json
-import pickle
 import sys
 
-import gymnax
 import jax
 import pandas as pd
 import pytest
-from support import is_drawn, paper_se, paper_training, refusal, refused
+from support import is_drawn, paper_se, paper_training, refused
 
 import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
 from sejax.evaluate import evaluate, summarise
-from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import registry
 from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
+from sejax.runs import plots
 from sejax.runs.worlds import proxy_setup
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -223,16 +221,14 @@ def test_an_evaluations_mean_leaves_no_agent_out():
     assert (row["test_return_mean"], row["num_nonfinite"]) == (-10.0, 1)
 
 
-def test_a_test_that_may_never_end_is_refused_beside_the_training_budget():
-    env = gymnax.make("Pendulum-v1")[0]
-    task = sejax.Task(name="endless", env=env, max_steps=1_000_000_000)
-    agent = sejax.make_agent(sejax.TD3Config(), task)
-    training = sejax.TrainingConfig(max_steps=60, max_episodes=60)
-    error = refusal(make_evaluator, agent, env, task, training)
-    assert error.field == "env.max_steps" and "of 60 steps" in str(error)
-
-
-def test_pickling_an_agent_says_what_to_send_in_its_place():
-    agent = sejax.make_agent(sejax.DDQNConfig(hidden_size=4), sejax.envs.make("cartpole"))
-    with pytest.raises(TypeError, match="Send its configuration"):
-        pickle.dumps(agent)
+def test_pictures_have_a_title_and_a_panel_for_each_number(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "_write", lambda figure, path: drawn.append(figure))
+    names = ("incumbent_mean", "incumbent_std", "population_mean", "population_max")
+    rows = [{"generation": i, "train_steps_mean": 5} | dict.fromkeys(names, 1.0) for i in range(2)]
+    plots.learning_curve(rows, None, tmp_path, "cartpole, SE, ddqn")
+    table = {"test_return": [1.0, 1.0], "train_steps": [7, 7], "train_episodes": [5, 6]}
+    plots.evaluation({("the proxy", "ddqn"): table}, None, tmp_path, "ddqn on cartpole")
+    assert [len(figure.axes) for figure in drawn] == [2, 3]
+    assert drawn[0].axes[0].get_title() == "cartpole, SE, ddqn"
+    assert drawn[1].get_suptitle() == "ddqn on cartpole"

@@ -114,13 +114,16 @@ def test_filters_of_images_equal_flax_convolution():
     net = OnImages(image, 7, inner)
     params = random_like(shapes_of(net.init, jax.random.key(0), np.zeros(60))["params"])
     x = np.random.default_rng(0).normal(size=(60, 5)).astype(np.float32)
+
     filters = params["filters"]
-    conv = {"kernel": filters["kernel"].reshape(7, 3, 3, 2).transpose(1, 2, 3, 0)}
-    conv["bias"] = filters["bias"]
-    images = x.T.reshape(5, *image)
-    filtered = nn.Conv(7, (3, 3), padding="VALID").apply({"params": conv}, images)
+    kernel = filters["kernel"].reshape(7, 3, 3, 2).transpose(1, 2, 3, 0)
+    conv = nn.Conv(7, (3, 3), padding="VALID")
+    filtered = conv.apply({"params": {"kernel": kernel, "bias": filters["bias"]}},
+                          x.T.reshape(5, *image))  # fmt: skip
     seen = np.maximum(filtered, 0).transpose(3, 1, 2, 0).reshape(-1, 5)  # [filter row column, 5]
     expected = inner.apply({"params": params["network"]}, seen)
-    for columns in (slice(None), 2):
-        values = net.apply({"params": params}, x[:, columns])
-        np.testing.assert_allclose(values, expected[:, columns], rtol=1e-4, atol=1e-5)
+
+    np.testing.assert_allclose(net.apply({"params": params}, x), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        net.apply({"params": params}, x[:, 2]), expected[:, 2], rtol=1e-4, atol=1e-5
+    )

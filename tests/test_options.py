@@ -93,7 +93,7 @@ def test_a_subclass_that_changes_a_default_keeps_rule_marks_and_help_text():
 
 def test_numbers_of_numpy_and_jax_become_pythons():
     config = Config(size=np.int64(3), rate=np.float32(0.5), share=jnp.float32(0.25),
-                    unruled=np.longdouble(2), limit=jnp.int32(9))  # fmt: skip
+                    unruled=np.float64(2), limit=jnp.int32(9))  # fmt: skip
     assert config == Config(size=3, rate=0.5, share=0.25, unruled=2.0, limit=9)
     assert type(config.size) is type(config.limit) is int
     assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}

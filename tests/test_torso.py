@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from support import refused
 
 import sejax
 from sejax.envs.environment import Environment, EnvState
 from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.ops.networks import init_narrowed
 from sejax.training import TrainingConfig, make_trainer
 
 SMALL = {"torso": "conv", "num_filters": 4, "num_layers": 1, "hidden_size": 16}
@@ -18,7 +18,6 @@ AGENTS = {
     "ppo": sejax.PPOConfig(**SMALL, rollout_steps=64),
 }  # fmt: skip
 IMAGE = (4, 5, 2)
-KEYS = jax.random.split(jax.random.key(1), 200)
 
 
 @struct.dataclass
@@ -52,8 +51,9 @@ class Patterns(Environment):
 @pytest.fixture(scope="module")
 def task():
     size = int(np.prod(IMAGE))
-    observation = Box((0.0,) * size, (1.0,) * size, IMAGE)
-    spec = TaskSpec(observation=observation, action=Discrete(2), max_steps=1)
+    spec = TaskSpec(
+        observation=Box((0.0,) * size, (1.0,) * size, IMAGE), action=Discrete(2), max_steps=1
+    )
     return sejax.Task.of(spec, name="patterns", env=Patterns(spec))
 
 
@@ -65,18 +65,30 @@ def test_gymnax_images_keep_their_shape():
     assert sejax.envs.make("cliff_walking").image == ()
 
 
-@pytest.mark.parametrize("name", AGENTS)
-def test_an_agent_tells_patterns_apart(task, name):
-    agent = sejax.make_agent(AGENTS[name], task)
+@pytest.mark.parametrize("agent", AGENTS)
+def test_an_agent_tells_patterns_apart(task, agent):
+    made = sejax.make_agent(AGENTS[agent], task)
     limits = TrainingConfig(max_steps=1500, max_episodes=1500, stop_rule="never")
-    state = jax.jit(make_trainer(agent, task.env, limits))(KEYS[0], task.params).agent_state
-    obs, states = jax.vmap(task.env.reset_env, (0, None))(KEYS, task.params)
-    act = jax.vmap(lambda obs: agent.act(KEYS[0], state, obs, explore=False))
+    train = jax.jit(make_trainer(made, task.env, limits))
+    trained = train(jax.random.key(0), task.params)
+    obs, states = jax.vmap(lambda key: task.env.reset_env(key, task.params))(
+        jax.random.split(jax.random.key(1), 200)
+    )
+    act = jax.vmap(lambda x: made.act(jax.random.key(2), trained.agent_state, x, explore=False))
     assert np.mean(act(obs) == states.kind) > 0.9
 
 
 @pytest.mark.parametrize("agent", ["ddqn", "ppo"])
 def test_a_torso_needs_images(agent):
-    task = sejax.envs.make("cartpole")
-    assert refused(sejax.make_agent, AGENTS[agent], task) == "agent.torso"
-    assert refused(type(AGENTS[agent]), num_filters=4) == "agent.num_filters"
+    with pytest.raises(sejax.ConfigError, match=r"agent\.torso must be null .* got conv\."):
+        sejax.make_agent(AGENTS[agent], sejax.envs.make("cartpole"))
+    with pytest.raises(sejax.ConfigError, match=r"agent\.num_filters must be left out .* got 4\."):
+        type(AGENTS[agent])(num_filters=4)
+
+
+def test_units_behind_a_torso_can_be_switched_off(task):
+    net = AGENTS["ddqn"].with_torso(AGENTS["ddqn"].network(2), IMAGE)
+    params = init_narrowed(net, jax.random.key(0), task.obs_dim, jnp.float32(10))["params"]
+    layer = params["network"]["Dense_0"]
+    assert not np.any(layer["bias"][10:]) and not np.any(layer["kernel"][10:])
+    assert np.all(layer["bias"][:10] != 0) and np.all(params["filters"]["bias"] != 0)
