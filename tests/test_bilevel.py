@@ -64,6 +64,7 @@ def on_one_device(words):
 
 @pytest.fixture(scope="module")
 def one_device():
+    """Of DDQN agents."""
     return on_one_device(TINY)
 
 
@@ -96,10 +97,9 @@ def test_a_generation_measures_the_incumbent_and_then_moves_it(one_device):
 def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
     _, _, runs = one_device
     for states, infos in runs:
-        means = [float(info.incumbent_mean) for info in infos]
-        np.testing.assert_allclose(
-            [float(info.best_so_far) for info in infos], np.maximum.accumulate(means)
-        )
+        means = np.array([info.incumbent_mean for info in infos])
+        best_so_far = [info.best_so_far for info in infos]
+        np.testing.assert_allclose(best_so_far, np.maximum.accumulate(means))
         best = max(range(len(means)), key=lambda i: (means[i], i))
         assert states[-1].best_generation == best and states[-1].best_score == means[best]
         np.testing.assert_array_equal(states[-1].best, states[best + 1].incumbent)
@@ -118,8 +118,7 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
 
 def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trainings one by one with tests of one step, and tell."""
-    config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)
-    program = make_bilevel(**config.parts())
+    program = program_of("devices=1", "objective.first_eval_steps=1", words=ROOM)
     state = program.init(KEYS[0])
     candidates = program.ask(state)
     assert candidates.test_params.scored_steps == 1 < program.proxy.task.max_steps
@@ -133,15 +132,11 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
 
 
 def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
-    _, generation, _ = one_device
-    hlo = generation.as_text()
-    assert "f32[40,11]" in hlo  # the replay buffer: 40 rows of 2 * 4 + 3
-    copies = [
-        line
-        for op, line in large_ops_in_loops(hlo, num_elements=440)
-        if "f32[40,11]" in line.split("(")[0] and op in ("copy", "select")
-    ]
-    assert not copies, copies
+    hlo = one_device[1].as_text()
+    buffer = "f32[40,11]"  # replay: 40 rows of 2 * 4 + 3
+    assert buffer in hlo
+    for op, line in large_ops_in_loops(hlo, num_elements=440):
+        assert buffer not in line.split("(")[0] or op not in ("copy", "select"), line
 
 
 # --- the same numbers, however it is run ---------------------------------------------------------

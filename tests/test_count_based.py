@@ -43,16 +43,16 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config, power):
 
 
 def test_beta_and_the_numbers_inside_are_traced():
-    agent = counting()
-    assert agent.hparams.agent == PLAIN.hparams and agent.hparams.reward_scale == BETA
+    hparams = counting().hparams
+    assert hparams.agent == PLAIN.hparams and hparams.reward_scale == BETA
 
     def after(beta, rate):
-        inner = agent.hparams.agent.replace(learning_rate=rate)
-        state = agent.init(KEY, agent.hparams.replace(agent=inner, reward_scale=beta))
-        return agent.update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
+        inner = hparams.agent.replace(learning_rate=rate)
+        state = counting().init(KEY, hparams.replace(agent=inner, reward_scale=beta))
+        return counting().update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
 
-    got = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
-    np.testing.assert_allclose(got, [1.0, 1.2, 1.0], rtol=1e-6)
+    values = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
+    np.testing.assert_allclose(values, [1.0, 1.2, 1.0], rtol=1e-6)
 
 
 # --- in a training -------------------------------------------------------------------------------

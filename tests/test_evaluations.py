@@ -15,24 +15,19 @@ from sejax.ops.scores import finite_mean
 NAN, INF = np.nan, np.inf
 
 
-def seeds(config):
-    """The numbers of the distinct keys of the population and of the incumbent, as they come."""
-    strategy = config.make(6)
-    keys = strategy.evaluations.keys(jax.random.key(0), strategy.population_size)
-    data = [jax.random.key_data(group).reshape(-1, 2) for group in keys]
-    assert [group.shape for group in keys] == [(strategy.population_size, 2), (3, 1)]
-    _, numbers = np.unique(np.concatenate(data), axis=0, return_inverse=True)
-    return numbers
-
-
-@pytest.mark.parametrize(("cls", "size"), [(NESConfig, 3), (EvosaxConfig, 4)])
-def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls, size):
-    config = cls(population_size=size, num_evals=2, num_incumbent_evals=3)
-    numbers = seeds(config)
-    assert len(np.unique(numbers)) == len(numbers)
-    # Two evaluations: seeds 0 and 1 for each candidate; the incumbent's 0, 1, 2.
-    *shared, first, second, third = seeds(dataclasses.replace(config, common_random_numbers=True))
-    assert shared == [first, second] * (len(shared) // 2) and len({first, second, third}) == 3
+@pytest.mark.parametrize("cls", [NESConfig, EvosaxConfig])
+def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
+    config = cls(population_size=4, num_evals=2, num_incumbent_evals=3)
+    for shared in (False, True):
+        strategy = dataclasses.replace(config, common_random_numbers=shared).make(6)
+        size = strategy.population_size
+        population, incumbent = strategy.evaluations.keys(jax.random.key(0), size)
+        assert (population.shape, incumbent.shape) == ((size, 2), (3, 1))
+        seeds = [np.asarray(jax.random.key_data(keys)) for keys in (population, incumbent)]
+        num_seeds = len(np.unique(np.concatenate([x.reshape(-1, 2) for x in seeds]), axis=0))
+        assert num_seeds == (3 if shared else 2 * size + 3)
+        if shared:  # two for each candidate, which are the first two of the incumbent
+            np.testing.assert_array_equal(seeds[0], np.tile(seeds[1][None, :2, 0], (size, 1, 1)))
 
 
 # --- what is evaluated, and its scores -----------------------------------------------------------

@@ -12,16 +12,15 @@ from sejax.options import registry
 
 
 def outcome(test_return, train_steps, nonfinite):
-    count = len(test_return)
+    returns, ones = jnp.float32(test_return)[:, None], jnp.ones(len(test_return), jnp.int32)
     return Outcome(
-        # The mean over three episodes of each agent.
-        test_returns=jnp.array([[x - 1, x, x + 1] for x in test_return], jnp.float32),
-        scored_returns=jnp.array([[2 * x - 1, 2 * x + 1] for x in test_return], jnp.float32),
+        test_returns=returns + jnp.float32([-1, 0, 1]),  # the mean over three episodes
+        scored_returns=2 * returns + jnp.float32([-1, 1]),
         train_steps=jnp.array(train_steps, jnp.int32),
-        train_episodes=jnp.ones(count, jnp.int32),
-        auc=jnp.arange(count, dtype=jnp.float32),
+        train_episodes=ones,
+        auc=jnp.arange(len(ones), dtype=jnp.float32),
         nonfinite=jnp.array(nonfinite),
-        real_steps=jnp.ones(count, jnp.int32),
+        real_steps=ones,
     )
 
 
