@@ -5,15 +5,14 @@ episode's scripted return at its end. Nothing depends on random numbers but a ta
 episode's observations.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment, spaces
 
 from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Transition, replay_buffer
+from sejax.envs.environment import Environment, EnvParams, EnvState
+from sejax.envs.spec import Box, Discrete, TaskSpec
 
 MAX_EPISODES = 12
 MAX_STEPS = 4  # the world's step limit
@@ -21,47 +20,41 @@ WHO = 100  # an action is WHO * episode + time
 
 
 @struct.dataclass
-class ScriptState(environment.EnvState):
+class ScriptState(EnvState):
     tag: jax.Array  # drawn at reset
 
 
 @struct.dataclass
-class ScriptParams(environment.EnvParams):
+class ScriptParams(EnvParams):
     returns: jax.Array = None  # [MAX_EPISODES]
     lengths: jax.Array = None  # [MAX_EPISODES]: step at which each episode terminates
-    nonfinite_episode: Any = -1  # its second step is not a number
+    nonfinite_episode: int = -1  # its second step is not a number
     max_steps_in_episode: int = MAX_STEPS
 
 
-class ScriptedEnv(environment.Environment[ScriptState, ScriptParams]):
-    @property
-    def default_params(self):
-        return script([0.0] * MAX_EPISODES, [1] * MAX_EPISODES)
+class ScriptedEnv(Environment[ScriptState, ScriptParams]):
+    def __init__(self):
+        actions = Discrete(WHO * (MAX_EPISODES + 1))
+        spec = TaskSpec(
+            observation=Box((0.0,) * 2, (1.0,) * 2), action=actions, max_steps=MAX_STEPS
+        )
+        super().__init__(spec, script([0.0] * MAX_EPISODES, [1] * MAX_EPISODES))
 
-    def reset_env(self, key, params):
-        state = ScriptState(time=jnp.int32(0), tag=jax.random.uniform(key))
-        return self.get_obs(state), state
+    def start(self, key):
+        return ScriptState(time=jnp.int32(0), tag=jax.random.uniform(key))
 
     def step_env(self, key, state, action, params):
         episode, time = action // WHO, state.time + 1
         terminated = time >= params.lengths[episode]
         last = terminated | (time >= params.max_steps_in_episode)
-        state = state.replace(time=time)
-        info = {
-            "discount": 1.0 - terminated,
-            "nonfinite": (episode == params.nonfinite_episode) & (time == 2),
-        }
+        nonfinite = (episode == params.nonfinite_episode) & (time == 2)
         reward = jnp.where(last, params.returns[episode], 0.0)
-        return self.get_obs(state), state, reward, terminated, info
+        info = {"discount": 1.0 - terminated, "nonfinite": nonfinite}
+        state = state.replace(time=time)
+        return self.observe(state), state, reward, terminated, info
 
-    def get_obs(self, state, params=None, key=None):
+    def observe(self, state):
         return jnp.stack([state.time.astype(jnp.float32), state.tag])
-
-    def observation_space(self, params=None):
-        return spaces.Box(-jnp.inf, jnp.inf, (2,), jnp.float32)
-
-    def action_space(self, params=None):
-        return spaces.Discrete(WHO * (MAX_EPISODES + 1))
 
 
 @struct.dataclass
@@ -74,18 +67,14 @@ class ScriptedAgentState:
 
 
 def script(returns, lengths, **fields):
-    return ScriptParams(
-        returns=jnp.array(returns, jnp.float32), lengths=jnp.array(lengths, jnp.int32), **fields
-    )
+    returns, lengths = jnp.array(returns, jnp.float32), jnp.array(lengths, jnp.int32)
+    return ScriptParams(returns=returns, lengths=lengths, **fields)
 
 
 def scripted_agent(warmup_episodes=2, batch_size=64):
+    obs, number = jnp.zeros((2, batch_size)), jnp.zeros(batch_size)
     empty = Transition(
-        obs=jnp.zeros((2, batch_size)),
-        action=jnp.zeros(batch_size, jnp.int32),
-        reward=jnp.zeros(batch_size),
-        discount=jnp.zeros(batch_size),
-        next_obs=jnp.zeros((2, batch_size)),
+        obs=obs, action=number.astype(jnp.int32), reward=number, discount=number, next_obs=obs
     )
 
     def init(key, hparams):
@@ -95,11 +84,8 @@ def scripted_agent(warmup_episodes=2, batch_size=64):
         )  # fmt: skip
 
     def update(key, state, batch):
-        return state.replace(
-            num_updates=state.num_updates + 1,
-            batch=batch,
-            min_discount=jnp.minimum(state.min_discount, batch.discount.min()),
-        )
+        least = jnp.minimum(state.min_discount, batch.discount.min())
+        return state.replace(num_updates=state.num_updates + 1, batch=batch, min_discount=least)
 
     return Agent(
         init=init,

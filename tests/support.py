@@ -89,7 +89,7 @@ def bits(tree):
 
 
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
-    """The MLP on a single input `[in]`, by plain loops over units."""
+    """The MLP on a single input `[in]`, in NumPy and doubles."""
     activate = {
         "tanh": np.tanh,
         "fast_tanh": np.tanh,  # within the tolerance of whoever compares
@@ -98,9 +98,8 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
         "prelu": lambda x: np.where(x >= 0, x, prelu_slope * x),
     }[activation]
     for layer in range(num_layers + 1):
-        kernel = np.asarray(params[f"Dense_{layer}"]["kernel"], np.float64)
-        bias = np.asarray(params[f"Dense_{layer}"]["bias"], np.float64)
-        x = np.array([sum(w * v for w, v in zip(row, x, strict=True)) for row in kernel]) + bias
+        dense = jax.tree.map(np.float64, params[f"Dense_{layer}"])
+        x = dense["kernel"] @ x + dense["bias"]
         if layer < num_layers:
             x = activate(x)
     return x
@@ -115,16 +114,6 @@ def random_columns(rng, obs_dim, batch_size):
         "next_obs": rng.normal(size=(obs_dim, batch_size)),
     }
     return {name: np.float32(x) for name, x in arrays.items()}
-
-
-def train_on(agent, batch, num_updates):
-    """The agent after so many updates on a batch; to be called in a jitted function."""
-
-    def step(state, key):
-        return agent.update(key, state, batch), None
-
-    state = agent.init(jax.random.key(0), agent.hparams)
-    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
 
 
 @functools.cache
@@ -169,32 +158,20 @@ def large_ops_in_loops(hlo, num_elements):
         if header:
             name = header.group(1)
             computations[name] = []
-        elif line.startswith("}"):
-            name = None
         elif name:
             computations[name].append(line.strip())
-    pending = {body for body in re.findall(r"body=%?([\w.\-]+)", hlo)}
+    reached, pending = set(), set(re.findall(r"body=%?([\w.\-]+)", hlo))
     assert pending, "the program has no loop"
-    reached = set()
     while pending:
-        name = pending.pop()
-        reached.add(name)
-        called = re.findall(
-            r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.\-]+)",
-            "\n".join(computations[name]),
-        )
-        for branches in re.findall(
-            r"(?:branch_computations|called_computations)=\{(.*?)\}", "\n".join(computations[name])
-        ):
-            called += re.findall(r"%?([\w.\-]+)", branches)
-        pending |= set(called) - reached
-    found = []
-    for name in sorted(reached):
-        for line in computations[name]:
-            op = re.search(r"= \w+\[([\d,]*)\]\S* ([\w\-]+)\(", line)  # results that are no tuple
-            if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
-                found.append((op.group(2), line))
-    return [(op, line) for op, line in found if op not in IN_PLACE]
+        reached |= pending
+        text = "\n".join(line for name in pending for line in computations[name])
+        pending = (computations.keys() & set(re.findall(r"[\w.\-]+", text))) - reached
+    large = []
+    for line in (line for name in sorted(reached) for line in computations[name]):
+        op = re.search(r"= \w+\[([\d,]*)\]\S* ([\w\-]+)\(", line)  # results that are no tuple
+        if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
+            large.append((op.group(2), line))
+    return [(op, line) for op, line in large if op not in IN_PLACE]
 
 
 def metrics(folder):

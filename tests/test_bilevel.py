@@ -64,6 +64,7 @@ def on_one_device(words):
 
 @pytest.fixture(scope="module")
 def one_device():
+    """Of DDQN agents."""
     return on_one_device(TINY)
 
 
@@ -78,54 +79,46 @@ def room():
 def test_a_generation_measures_the_incumbent_and_then_moves_it(one_device):
     _, _, ((states, infos), _) = one_device
     moves = []
-    for (before, after), info in zip(itertools.pairwise(states), infos, strict=True):
+    for number, ((before, after), info) in enumerate(
+        zip(itertools.pairwise(states), infos, strict=True)
+    ):
         np.testing.assert_array_equal(after.incumbent, before.es_state.mean)
         np.testing.assert_array_equal(after.incumbent_score, info.incumbent_mean)
         # All Better 2 moves the mean exactly if a member beats the incumbents' mean.
         moves.append(bool((after.es_state.mean != before.es_state.mean).any()))
         assert moves[-1] == bool(info.population_max > info.incumbent_mean)
+        assert info.generation == number and info.active and info.num_nonfinite == 0
+        assert 0 < info.train_steps_max <= 40
+        np.testing.assert_allclose(info.train_steps.sum(), 12 * info.train_steps_mean, rtol=1e-6)
+        assert (info.real_steps >= 2 * 5).all()  # 2 tests of at least 5 steps each
     assert any(moves)
 
 
 def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
     _, _, runs = one_device
     for states, infos in runs:
-        means = [float(info.incumbent_mean) for info in infos]
-        np.testing.assert_allclose(
-            [float(info.best_so_far) for info in infos], np.maximum.accumulate(means)
-        )
+        means = np.array([info.incumbent_mean for info in infos])
+        best_so_far = [info.best_so_far for info in infos]
+        np.testing.assert_allclose(best_so_far, np.maximum.accumulate(means))
         best = max(range(len(means)), key=lambda i: (means[i], i))
         assert states[-1].best_generation == best and states[-1].best_score == means[best]
         np.testing.assert_array_equal(states[-1].best, states[best + 1].incumbent)
 
 
-def test_infos_count_generations_and_steps(one_device):
-    program, _, ((_, infos), _) = one_device
-    assert program.strategy.num_evaluations == 12  # 4 members with two signs, 4 incumbents
-    for number, info in enumerate(infos):
-        assert info.generation == number and info.active
-        assert info.train_steps.shape == info.real_steps.shape == (12,)
-        np.testing.assert_allclose(info.train_steps.sum(), 12 * info.train_steps_mean, rtol=1e-6)
-        assert 0 < info.train_steps_max <= 40
-        assert info.num_nonfinite == 0
-        assert (info.real_steps >= 2 * 5).all()  # 2 tests of at least 5 steps each
-
-
 def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     program, _, ((states, infos), (others, _)) = one_device
-    assert (states[0].incumbent != others[0].incumbent).any()
     assert len({float(info.population_mean) for info in infos}) == 3
-    asked = [program.ask(state).keys for state in (states[0], states[1], others[0])]
-    groups = [keys for groups in asked for keys in groups]
+    assert program.strategy.num_evaluations == 12  # 4 members with two signs, 4 incumbents
+    groups = [
+        keys for state in (states[0], states[1], others[0]) for keys in program.ask(state).keys
+    ]
     data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in groups])
-    assert len(data) == 3 * program.strategy.num_evaluations
-    assert len(np.unique(data, axis=0)) == len(data)
+    assert len(np.unique(data, axis=0)) == len(data) == 3 * 12
 
 
 def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trainings one by one with tests of one step, and tell."""
-    config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)
-    program = make_bilevel(**config.parts())
+    program = program_of("devices=1", "objective.first_eval_steps=1", words=ROOM)
     state = program.init(KEYS[0])
     candidates = program.ask(state)
     assert candidates.test_params.scored_steps == 1 < program.proxy.task.max_steps
@@ -139,32 +132,28 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
 
 
 def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
-    _, generation, _ = one_device
-    hlo = generation.as_text()
-    assert "f32[40,11]" in hlo  # the replay buffer: 40 rows of 2 * 4 + 3
-    copies = [
-        line
-        for op, line in large_ops_in_loops(hlo, num_elements=440)
-        if "f32[40,11]" in line.split("(")[0] and op in ("copy", "select")
-    ]
-    assert not copies, copies
+    hlo = one_device[1].as_text()
+    buffer = "f32[40,11]"  # replay: 40 rows of 2 * 4 + 3
+    assert buffer in hlo
+    for op, line in large_ops_in_loops(hlo, num_elements=440):
+        assert buffer not in line.split("(")[0] or op not in ("copy", "select"), line
 
 
 # --- the same numbers, however it is run ---------------------------------------------------------
 
 
 def assert_result_equals_run(result, program, states, infos, **tolerance):
-    assert_close(result.weights, program.unravel(states[-1].best), **tolerance)
-    assert_close(result.last_weights, program.unravel(states[-1].incumbent), **tolerance)
     history = jax.tree.map(lambda *x: jnp.stack(x), *infos)
-    assert_close(result.info, history, **tolerance)
-    assert result.generation == states[-1].best_generation
-    assert_close(result.score, states[-1].best_score, **tolerance)
+    last = states[-1]
+    expected = (program.unravel(last.best), program.unravel(last.incumbent), history)
+    assert_close((result.weights, result.last_weights, result.info), expected, **tolerance)
+    assert result.generation == last.best_generation
+    assert_close(result.score, last.best_score, **tolerance)
 
 
-def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(one_device):
-    program, _, ((states, infos), _) = one_device
-    result = jax.jit(make_learner(tiny("devices=2")))(KEYS[0])
+def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(room):
+    program, _, ((states, infos), _) = room
+    result = jax.jit(make_learner(tiny("devices=2", words=ROOM)))(KEYS[0])
     assert_result_equals_run(result, program, states, infos, rtol=0)
 
 
@@ -220,54 +209,37 @@ def test_a_population_of_proxies_that_diverge_is_counted_and_leaves_no_trace(one
 
 def test_an_incumbent_that_diverges_is_never_the_best(one_device):
     _, generation, ((states, _), _) = one_device
-    broken = states[0].replace(
-        es_state=states[0].es_state.replace(mean=jnp.full_like(states[0].es_state.mean, jnp.nan))
-    )
+    es_state = states[0].es_state
+    broken = states[0].replace(es_state=es_state.replace(mean=jnp.nan * es_state.mean))
     after, info = generation(broken)
     assert info.num_nonfinite == 12
     assert after.incumbent_score == -jnp.inf and after.best_generation == -1
     np.testing.assert_array_equal(after.best, states[0].best)
 
 
-def test_more_devices_than_there_are_is_refused():
-    assert refused(make_learner, tiny(f"devices={jax.device_count() + 1}")) == "devices"
-
-
-@pytest.mark.parametrize("part", ["task", "agent", "proxy", "es", "objective"])
-def test_a_name_in_the_place_of_an_object_is_refused(part):
+@pytest.mark.parametrize(("part", "value"), [
+    ("task", "nes"), ("agent", "nes"), ("proxy", "nes"), ("es", "nes"), ("objective", "nes"),
+    ("generations", 0), ("generations", 1.5), ("devices", jax.device_count() + 1),
+])  # fmt: skip
+def test_what_no_learner_can_be_made_of_is_refused(part, value):
     parts = tiny(words=ROOM).parts()
-    assert refused(make_learner, **parts | {part: "nes"}) == part
+    assert refused(make_learner, **parts | {part: value}) == part
 
 
-@pytest.mark.parametrize("generations", [-1, 0, 1.5, 10**9])
-def test_a_number_of_generations_that_cannot_be_is_refused(generations):
-    assert (
-        refused(make_learner, **tiny(words=ROOM).parts(), generations=generations) == "generations"
-    )
-
-
-@pytest.mark.parametrize(
-    ("words", "overrides"),
-    [
-        (ROOM, ("es=open_es",)), (ROOM, ("proxy=rn", "objective=auc")),
-        (ROOM, ("es.mirrored=false", "es.num_evals=2")),
-        (TINY, ("agent.activation=prelu", "proxy.activation=prelu", "proxy.done=threshold")),
-    ],
-    ids=lambda words: " ".join(words) if isinstance(words, tuple) else words[0],
-)  # fmt: skip
+@pytest.mark.parametrize(("words", "overrides"), [
+    (ROOM, ("es=open_es",)), (ROOM, ("proxy=rn", "objective=auc")),
+    (ROOM, ("es.mirrored=false", "es.num_evals=2")),
+    (TINY, ("agent.activation=prelu", "proxy.activation=prelu", "proxy.done=threshold")),
+], ids=lambda words: " ".join(words) if isinstance(words, tuple) else words[0])  # fmt: skip
 def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     # Tracing only: the state that comes out has the types of the one that goes in.
     program = program_of(*overrides, words=words)
     state = jax.eval_shape(program.init, KEYS[0])
     after, info = jax.eval_shape(program.generation, state)
-    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)  # noqa: E731
-    assert kind(after) == kind(state)
-    columns = dict(vars(info))
-    assert {x.shape for x in jax.tree.leaves(columns.pop("by_agent"))} == {(1,)}
-    num_population = program.strategy.population_size * program.strategy.evaluations.num_evals
-    assert columns.pop("population_scores").shape == (num_population,)
-    num_candidates = program.strategy.num_evaluations
-    assert {columns.pop(name).shape for name in ("train_steps", "real_steps")} == {
-        (num_candidates,)
-    }
-    assert {x.shape for x in columns.values()} == {()}
+    types = [[(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(x)] for x in (state, after)]
+    assert types[0] == types[1]
+    strategy = program.strategy
+    num_population = strategy.population_size * strategy.evaluations.num_evals
+    assert info.population_scores.shape == (num_population,)
+    assert info.train_steps.shape == info.real_steps.shape == (strategy.num_evaluations,)
+    assert info.incumbent_mean.shape == ()

@@ -19,25 +19,8 @@ from support import ended, refusal
 
 import sejax
 from sejax import __main__ as program
-from sejax.ops.files import cache_folder
 from sejax.options.plain import expanded
 from sejax.runs import commands, runtime
-
-
-def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
-    for name in ("SEJAX_CACHE_DIR", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as where nobody's home is known
-    assert cache_folder() is None
-
-
-@pytest.mark.parametrize(
-    ("words", "devices"),
-    [(["devices=3"], 3), (["devices=3", "devices=2"], 2), (["devices=0"], None),
-     (["devices=99999999999"], None), (["devices=x"], None), (["seed=1"], None)],
-)  # fmt: skip
-def test_devices_are_known_before_anything_is_composed(words, devices):
-    assert commands._devices(words) == devices
 
 
 def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, capsys, tmp_path):
@@ -61,14 +44,9 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path, monkeypatch, cap
 # --- what people type ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("words", "meant"), [
-    (["--env", "cartpole"], "env=cartpole."), (["--env=cartpole", "seed=1"], "env=cartpole."),
-    (["-agent"], "agent=VALUE."), (["--seed", "env=cartpole"], "seed=VALUE."),
-])  # fmt: skip
-def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words, meant):
-    main = functools.partial(commands.start, sejax.config, str)
-    status, _, said = ended(monkeypatch, capsys, main, *words)
-    assert status == commands.BAD_INPUT and said.count("\n") == 1 and f"Write {meant}" in said
+@pytest.mark.parametrize("words", [["--env", "cartpole"], ["--env=cartpole", "seed=1"]])
+def test_an_option_with_dashes_is_answered_with_an_override(words):
+    assert "Write env=cartpole" in str(refusal(sejax.config, words))
 
 
 @pytest.mark.parametrize("words", [[], ["--help"]])
@@ -78,13 +56,10 @@ def test_without_a_word_the_commands_are_listed_a_line_each(monkeypatch, capsys,
     assert all(f"\n  {name} " in said for name in program.COMMANDS)
 
 
-@pytest.mark.parametrize(
-    ("word", "meant"), [("train", "sejax run."), ("seed=1", "sejax run seed=1.")]
-)
-def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys, word, meant):
-    status, _, said = ended(monkeypatch, capsys, program.main, word)
+def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys):
+    status, _, said = ended(monkeypatch, capsys, program.main, "seed=1")
     assert status == commands.BAD_INPUT
-    assert said.startswith(f"error: There is no command {word}. Write {meant}\n")
+    assert said.startswith("error: There is no command seed=1. Write sejax run seed=1.\n")
     assert said.count("\n") == len(program.COMMANDS) + 3
 
 
@@ -105,19 +80,11 @@ def test_an_error_in_code_of_ones_own_ends_with_its_place(monkeypatch, capsys, t
     monkeypatch.chdir(tmp_path)
     import my_code
 
-    def main():
-        with commands.messages():
-            my_code.fails(0)
-
+    main = functools.partial(commands.start, lambda _: my_code.fails(0), str)
     status, _, said = ended(monkeypatch, capsys, main)
     assert status == commands.FAILED and said.startswith("Traceback")
     raised = "ZeroDivisionError: division by zero (my_code.py:2: return 1 / x)"
     assert said.endswith(f"\nerror: code of your own raised {raised}\n")
-
-
-def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
-    with pytest.raises(TypeError):
-        ended(monkeypatch, capsys, functools.partial(commands.start, int, str), "x")
 
 
 def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
@@ -137,26 +104,16 @@ def test_a_platform_that_jax_lacks_is_one_line_with_the_variable(tmp_path):
     platform = "nonsense" if find_spec("jax_cuda12_plugin") else "cuda"
     words = [sys.executable, "-m", "sejax.run", f"run_dir={tmp_path / 'run'}"]
     environment = os.environ | {"JAX_PLATFORMS": platform}
-    ended = subprocess.run(words, capture_output=True, text=True, env=environment)
-    assert ended.returncode == commands.BAD_INPUT and not (tmp_path / "run").exists()
-    *_, last = ended.stderr.splitlines()
+    done = subprocess.run(words, capture_output=True, text=True, env=environment)
+    assert done.returncode == commands.BAD_INPUT and not (tmp_path / "run").exists()
+    *_, last = done.stderr.splitlines()
     assert last.startswith("error: JAX_PLATFORMS must") and last.endswith("JAX_PLATFORMS=cpu.")
 
 
-@pytest.mark.parametrize(
-    ("mode", "value"),
-    [("jax_debug_nans", True), ("jax_debug_infs", True), ("jax_debug_key_reuse", True),
-     ("jax_enable_x64", True), ("jax_disable_jit", True), ("jax_transfer_guard", "disallow"),
-     ("jax_numpy_rank_promotion", "raise"), ("jax_numpy_dtype_promotion", "strict")],
-)  # fmt: skip
-def test_a_mode_of_jax_that_cannot_be_is_one_line_with_its_name(mode, value):
-    before = getattr(jax.config, mode)
-    jax.config.update(mode, value)
-    try:
+def test_64_bits_are_refused_with_one_line():
+    with jax.enable_x64(True):
         error = refusal(runtime.configure_jax)
-    finally:
-        jax.config.update(mode, before)
-    assert error.field == mode and f"Set {mode.upper()}=" in str(error)
+    assert error.field == "jax_enable_x64" and "Set JAX_ENABLE_X64=false." in str(error)
 
 
 def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):

@@ -4,24 +4,22 @@ import dataclasses
 import functools
 import random
 import sys
-import typing
 
 import pytest
 import yaml
 from support import ended, printed, refusal
 
 import sejax
-from sejax import distill, envs, evaluate, run
+from sejax import distill, evaluate, run
 from sejax.distill import DistillConfig
-from sejax.options import ConfigError, registry
+from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
-from sejax.runs import commands, preset_files
+from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.compose import expand
 from sejax.runs.config import EvaluateConfig, LearnConfig, evaluate_config, plain
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"]
-composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 
 
 def refused(*overrides, make=sejax.config):
@@ -37,33 +35,18 @@ def refused(*overrides, make=sejax.config):
 @pytest.mark.parametrize("preset", ("best", "paper", "paper_performance", "soft"))
 @pytest.mark.parametrize("env", ("cartpole", "acrobot"))
 def test_every_task_composes_with_every_preset(env, preset):
-    composed = composed_with(f"env={env}", f"preset={preset}")
+    composed = sejax.config([f"env={env}", f"preset={preset}"])
     assert (composed.name("env"), composed.preset) == (env, preset)
     # An SE gives no sign of the agent's progress: its own returns level off, or a budget ends.
     assert composed.training.stop_rule == "plateau" or composed.training.max_steps is not None
-    for group in (composed, composed.agent, composed.es, composed.training):
-        for name, kind in typing.get_type_hints(type(group)).items():
-            if kind in (int, float, bool, str):
-                assert type(getattr(group, name)) is kind, name
-
-
-@pytest.mark.parametrize("group", ["es", "objective", "exploration"])
-def test_every_choice_of_a_group_composes(group):
-    for name in registry.names(group):
-        env = ["env=cliff_walking"] if name == "count_based" else []
-        assert sejax.config([*env, f"{group}={name}"]).name(group) == name
 
 
 def test_a_task_chooses_its_agent_and_a_proxy_its_objective():
-    names = {env: composed_with(f"env={env}").name("agent") for env in envs.names()}
-    assert names == {
-        "cartpole": "ddqn", "cartpole_v1": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
-        "gridworld_2x2": "q_learning", "mountain_car": "ddqn", "mountain_car_continuous": "td3",
-        "pendulum": "td3", "halfcheetah": "td3", "hopper": "td3", "walker2d": "td3",
-        "swimmer": "td3", "inverted_pendulum": "td3", "ant": "td3", "reacher": "td3",
-    }  # fmt: skip
+    names = {"acrobot": "ddqn", "cliff_walking": "q_learning", "pendulum": "td3", "ant": "td3"}
+    for env, agent in names.items():
+        assert sejax.config([f"env={env}"]).name("agent") == agent
     assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
-    assert composed_with("proxy=rn").name("objective") == "reward_threshold"
+    assert sejax.config(["proxy=rn"]).name("objective") == "reward_threshold"
     assert sejax.config(["proxy=rn", "objective=max_reward"]).name("objective") == "max_reward"
 
 
@@ -91,46 +74,33 @@ def test_values_are_read_by_the_types_of_their_fields():
 # --- several agents -------------------------------------------------------------------------------
 
 
-def test_a_mixture_has_fields_for_each_agent():
-    composed = sejax.config(["agents=[td3_discrete,ddqn]", "agents.ddqn.batch_size=32",
-                             "agents.td3_discrete.weight=2", "agents.aggregate=min",
-                             "agents.compared_by=rank"])  # fmt: skip
-    assert composed.name("agent") == "ddqn+td3_discrete"
-    assert (composed.mixture.aggregate, composed.mixture.compared_by) == ("min", "rank")
-    assert composed.weights == (1.0, 2.0)
-    assert composed.agents["ddqn"].batch_size == 32
-    assert composed.parts()["agent"].weights == (1.0, 2.0)
-
-
-def test_an_agent_of_a_mixture_may_have_a_name_of_its_own():
-    config = sejax.config([*OWN_NAME, "agents.myopic.weight=2"])
-    assert sejax.config(["agent=ddqn", *OWN_NAME[1:], "agents.myopic.weight=2"]) == config
+def test_each_agent_of_a_mixture_has_fields_and_may_have_a_name_of_its_own():
+    config = sejax.config([*OWN_NAME, "agents.myopic.weight=2", "agents.aggregate=min"])
     sighted, myopic = config.agents.values()
-    assert myopic.discount == 0.0
+    assert (config.mixture.aggregate, config.weights) == ("min", (1.0, 2.0))
     assert sighted == sejax.config([]).agent, "with the settings of its preset"
-    assert dataclasses.replace(myopic, discount=0.99) == sighted
-    assert config.parts()["agent"].names == ("ddqn", "myopic")
+    assert myopic == dataclasses.replace(sighted, discount=0.0)
+    agent = config.parts()["agent"]
+    assert agent.names == ("ddqn", "myopic") and agent.weights == (1.0, 2.0)
 
 
 @pytest.mark.parametrize("preset", ["best", "paper"])
 def test_each_agent_of_a_mixture_has_the_settings_that_it_has_alone(preset):
     words = ("env=acrobot", f"preset={preset}", "training.max_steps=null")
-    for key, agent in composed_with(*words, "agents=[td3_discrete,ddqn]").agents.items():
-        assert agent == composed_with(*words, f"agent={key}").agent
+    for key, agent in sejax.config([*words, "agents=[td3_discrete,ddqn]"]).agents.items():
+        assert agent == sejax.config([*words, f"agent={key}"]).agent
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-rn", "cliff_walking-rn"])
+@pytest.mark.parametrize("name", ["cartpole", "cliff_walking-rn"])
 def test_evaluate_trains_the_agents_that_a_proxy_was_learned_with(name):
     config = evaluate_config([f"proxy={name}"])
     learned = sejax.load_proxy(name).learned_agents()
-    assert config.agents == learned
-    assert config.agent_hparams == "as_learned"
+    assert config.agents == learned and config.agent_hparams == "as_learned"
     for key, agent in learned.items():  # as one that is named, too
-        assert evaluate_config([f"proxy={name}", f"agent={key}"]).agent == agent
-        changed = evaluate_config([f"proxy={name}", f"agent={key}", "agent.discount=0.5"]).agent
+        words = [f"proxy={name}", f"agent={key}"]
+        changed = evaluate_config([*words, "agent.discount=0.5"]).agent
         assert changed == dataclasses.replace(agent, discount=0.5)
-        default = evaluate_config([f"proxy={name}", f"agent={key}", "agent_hparams=default"])
-        assert default.agent == type(agent)()
+        assert evaluate_config([*words, "agent_hparams=default"]).agent == type(agent)()
 
 
 def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():
@@ -156,10 +126,8 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     configs = run.configs_of(["seed=0,1", "es.noise_std=0.03,0.06", "num_seeds=2"])
     folders = {str(config.resolved_run_dir) for config in configs}
     assert len(folders) == 8 and all("noise_std" in folder for folder in folders)
-    folders = [
-        config.run_dir for config in run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
-    ]
-    assert folders == ["here/env_cartpole", "here/env_acrobot"]
+    configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
+    assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     configs = evaluate.configs_of(["proxy=cartpole", "seed=1,2"])
     assert [x.out_dir for x in configs] == ["runs/evaluate-seed_1", "runs/evaluate-seed_2"]
 
@@ -172,43 +140,38 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
     file.write_text("env: acrobot\npreset: paper\nes:\n  noise_std: 0.05\nagent.batch_size: 3\n")
     words = ["env=acrobot", "preset=paper", "es.noise_std=0.05", "agent.batch_size=7"]
     assert sejax.config([f"preset={file}", words[-1]]) == sejax.config(words)
-    file.write_text(preset_files.file_text(["agents=[ddqn,ppo]", "agents.ppo.weight=2"]))
-    assert sejax.config([f"preset={file}"]).weights == (1.0, 2.0)
 
 
 @pytest.mark.parametrize("overrides", [
-    [], ["env=pendulum", "agent=sac"], ["env=cliff_walking", "proxy=rn"], OWN_NAME,
-    ["agents=[ddqn,ppo]", "agents.ppo.weight=2"], ["es=snes", "env=gymnax/Catch-bsuite"],
+    [], ["env=cliff_walking", "proxy=rn"], [*OWN_NAME, "agents.myopic.weight=2"],
+    ["es=snes", "env=gymnax/Catch-bsuite"],
 ])  # fmt: skip
 def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, overrides):
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
-    assert configuration.learn_config(plain(config)) == config
-    assert configuration.completed(plain(config), config) == plain(config)
+    values = plain(config)
+    assert configuration.learn_config(values) == config
+    assert configuration.completed(values, config) == values
     if len(config.agents) == 1:  # as files had it before
-        older = plain(config) | {"agent": plain(config)["agents"].popitem()[1], "agents": None}
+        older = values | {"agent": plain(config)["agents"].popitem()[1], "agents": None}
         assert configuration.learn_config(older) == config
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(plain(config)))
-    preset = f"preset={tmp_path / 'config.yaml'}"
-    assert sejax.config([preset]) == config
-    assert sejax.config([preset, "generations=7"]) == dataclasses.replace(config, generations=7)
+    preset = tmp_path / "config.yaml"
+    preset.write_text(yaml.safe_dump(values))
+    changed = sejax.config([f"preset={preset}", "generations=7"])
+    assert changed == dataclasses.replace(config, generations=7)
 
 
 @pytest.mark.parametrize("overrides", [None, "env=cartpole", [3], {"env": "cartpole"}])
-@pytest.mark.parametrize("make", [sejax.config, evaluate_config])
-def test_overrides_are_a_list_of_text(make, overrides):
-    assert refusal(make, overrides).field == "overrides"
+def test_overrides_are_a_list_of_text(overrides):
+    assert refusal(sejax.config, overrides).field == "overrides"
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "[1, 2]", "just text", "a: [", "env: 3", "nope: 1", "env: nope", "preset: other.yaml",
-     "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]", "env: &a {x: *a}"],
+@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "nope: 1", "preset: other.yaml",
+                                  "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]"],
 )  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
     refused(f"preset={tmp_path / 'bad.yaml'}")
     assert refused(f"preset={tmp_path / 'nope.yaml'}").field == "preset"
-    assert refused(f"preset={tmp_path}.yaml").field == "preset"
 
 
 # --- bad input ------------------------------------------------------------------------------------
@@ -216,65 +179,45 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
 
 @pytest.mark.parametrize(("override", "field", "suggested"), [
     ("env=cartpol", "env", "env=cartpole"), ("preset=papers", "preset", "preset=paper"),
-    ("es.populaton_size=3", "es.populaton_size", "es.population_size"),
-    ("agent.batchsize=3", "agent.batchsize", "agent.batch_size"),
-    ("batch_size=3", "batch_size", "agent.batch_size"),
+    ("agent.batchsize=3", "agent.batchsize", "agent.batch_size"), ("seed=-1", "seed", ""),
+    ("batch_size=3", "batch_size", "agent.batch_size"), ("=1", "an override", ""),
     ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),
     ("env.goal_reward=-1", "env.goal_reward", "env=cliff_walking"),
-    ("foo", "an override", "env=foo"), ("generations.x=1", "generations", "got {'x': '1'}"),
-    ("env = cartpole seed=1", "an override", "Write env=cartpole."),
-    ("generations 30", "an override", "Write generations=30."),
-    ("env seed=1", "an override", "Write env=VALUE."),
-    ("runs/first seed=1", "an override", "proxy=runs/first"),
+    ("foo", "an override", "env="), ("generations.x=1", "generations", "got {'x': '1'}"),
     ("agents=[ddqn,ppo", "agents", "brackets close"),
-    ("agents=[ddqn, ppo]", "agents", "Set agents=[ddqn]."),
     ("es.score_transform=my_rank", "es.score_transform", "es.score_transform=rank?"),
     ("es.score_transform=rank.py:f", "es.score_transform", "es.score_transform=rank:f."),
-    ("agent=no_module_of:mine", "agent", "PYTHONPATH"),
+    ("agent=no_module_of:mine", "agent", "PYTHONPATH"), (f"agent=a:{'d' * 5000}", "agent", ""),
     ("agents=[ddqn,td3_discret]", "agents.td3_discret", "td3_discrete"),
-    ("agents=[]", "agents", "agents=[ddqn,ppo]"),
     ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
     ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
     ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
     ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
-    ("agents=[ddqn] agents.ddqn.weight=2", "agents.KEY.weight", "agents=[ddqn,ppo]"),
     ("preset=paper env=mountain_car", "preset", "preset=best"),
+    (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
+    ("es.population_size=1.5", "es.population_size", ""), ("agents=[ddqn,td3]", "agents.td3", ""),
+    ("stop_when_solved=maybe", "stop_when_solved", ""), ("agents=[ddqn,ddqn]", "agents", ""),
+    ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
+    ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
+    ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
+    ("proxy=rn stop_when_solved=true", "stop_when_solved", "=false"),
+    ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps",
+     ""), ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
 ])  # fmt: skip
-def test_bad_input_is_answered_with_what_to_type(override, field, suggested):
+def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
+    override, field, suggested
+):
     error = refused(*override.split(" "))
     assert error.field == field and suggested in str(error), error
 
 
 @pytest.mark.parametrize(("override", "field"), [
-    (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)"), ("=1", "an override"),
-    ("seed=-1", "seed"), ("es.population_size=1.5", "es.population_size"),
-    ("es.noise_std=nan", "es.noise_std"), ("agent.hidden_size=[1,2]", "agent.hidden_size"),
-    ("stop_when_solved=maybe", "stop_when_solved"), ("generations=1000000000", "generations"),
-    ("es.score_transform=a b:c", "an override"), (f"agent=a:{'d' * 5000}", "agent"),
-    ("agents=[ddqn,ddqn]", "agents"), ("agents=[ddqn,myopic]", "agents.myopic"),
-    ("agents=3", "agent"), ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight"),
-    ("agents=[ddqn,ppo] agents.ddqn.batch_size=0", "agents.ddqn.batch_size"),
-    ("agents=[ddqn,td3]", "agents.td3"), ("env=pendulum agent=ddqn", "agent"),
-    ("env=cliff_walking agent=sarsa exploration=icm", "exploration"),
-    ("training.stop_rule=solved training.solved_by=train", "training.solved_by"),
-    ("proxy=rn stop_when_solved=true", "stop_when_solved"),
-    ("training.max_episodes=3", "training.max_episodes"),
-    ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps"),
-    ("es=open_es es.population_size=3", "es.population_size"),
-])  # fmt: skip
-def test_bad_input_is_one_message_that_names_the_field(override, field):
-    assert refused(*override.split(" ")).field == field
-
-
-@pytest.mark.parametrize(("override", "field"), [
     ("num_agents=3", "proxy"), ("proxy=real agent_hparams=as_learned", "agent_hparams"),
-    ("proxy=real training_from=config", "training_from"), ("proxy=cartpole agent=2", "agent"),
+    ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
     ("proxy=real env=cartpole training.max_steps=9", "training"),
-    ("proxy=cartpole agent_hparams=as_learned agent=ppo", "agent"),
-    ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,ppo]", "agents"),
-    ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole seed=-1", "seed"),
+    ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
+    ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
-    ("proxy=cartpole agents=[1,2]", "agents.1"),
     ("proxy=cartpole agents=[ddqn,ppo] agents.ppo.weight=2", "agents.ppo.weight"),
 ])  # fmt: skip
 def test_what_evaluate_cannot_use_is_refused(override, field):
@@ -282,18 +225,19 @@ def test_what_evaluate_cannot_use_is_refused(override, field):
 
 
 def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
-    """No traceback, and nothing silent: what was composed has the values that were asked for."""
+    """No traceback, and nothing silent: what was composed has the values that were typed."""
     rng = random.Random(0)
+    fields = ("batch_size", "noise_std", "hidden_size", "max_steps", "activation", "done", "nope")
+    groups = ("agent", "es", "proxy", "training", "objective")
     names = [*LearnConfig.groups, "preset", "seed", "generations", "devices", "agents"]
-    fields = ("batch_size", "noise_std", "hidden_size", "max_steps", "activation", "learning_rate")
-    for group in ("agent", "es", "proxy", "training", "objective"):
-        names += [f"{group}.{field}" for field in (*fields, "done", "nope")]
-    texts = ["0", "1", "-1", "2.5", "1e-3", "64", "nan", "inf", "null", "true", "[]", "[1]", "["]
-    texts += ["[ddqn]", "x", "ddqn", "ppo", "acrobot", "rn", "relu", "paper", "threshold", "'", "☃"]
-    texts += ["a:b", "${x}", "{a:1}", "0x10", "1_000", "9" * 20, "~", "???"]
+    names += [f"{group}.{field}" for group in groups for field in fields]
+    texts = "0 1 -1 2.5 1e-3 64 nan inf null true [] [1] [ [ddqn] x ddqn ppo acrobot rn relu paper"
+    texts += " threshold ' ☃ a:b ${x} {a:1} 0x10 1_000 ~ ??? 99999999999999999999"
     composed = 0
-    for _ in range(600):
-        overrides = [f"{rng.choice(names)}={rng.choice(texts)}" for _ in range(rng.randint(1, 2))]
+    for _ in range(400):
+        overrides = [
+            f"{rng.choice(names)}={rng.choice(texts.split())}" for _ in range(rng.randint(1, 2))
+        ]
         try:
             config = sejax.config(overrides)
         except ConfigError as error:
@@ -310,9 +254,7 @@ def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
 # --- the command line -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("words", [["env=2"], ["agent.batchsize=3"], ["--multirun", "seed=0,1"],
-                                   ["--package", "x"], ["-m"], ["--resolve"], ["a b"], ["env=ä"],
-                                   ["~env=[[1]]"], ["hydra/job=3"], ["seed=0,x"]])  # fmt: skip
+@pytest.mark.parametrize("words", [["env=2"], ["--multirun", "seed=0,1"], ["a b"], ["~env=[[1]]"]])
 @pytest.mark.parametrize("module", [run, evaluate])
 def test_a_command_ends_bad_words_with_one_message_and_status_2(
     module, words, monkeypatch, tmp_path, capsys
@@ -325,36 +267,18 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("module", "words", "expected"), [
-    (run, [], ["agent.batch_size=64  # transitions", "preset=best", "env: cartpole"]),
-    (run, ["agents=[ddqn,ppo]"], ["agents.ddqn.weight=1.0  # share", "agents.aggregate=mean"]),
-    (run, ["preset=paper", "seed=3"],
-     ["steps of the outer loop. (preset=paper)", "seed=3 (typed)", "=83 (preset=paper)"]),
-    (evaluate, ["proxy=cartpole"], ["agents.ppo.epochs=10  # passes over", "(proxy)"]),
-    (evaluate, [], ["num_agents=10", "real_training.stop_rule=solved"]),
-    (distill, [], ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
+@pytest.mark.parametrize(("module", "words", "schema", "expected"), [
+    (run, [], LearnConfig, ["agent.batch_size=64  # transitions", "preset=best", "env: cartpole"]),
+    (run, ["agents=[ddqn,ppo]"], LearnConfig, ["agents.ddqn.weight=1.0  # share"]),
+    (run, ["preset=paper", "seed=3"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
+    (evaluate, ["proxy=cartpole"], EvaluateConfig, ["agents.ppo.epochs=10  # passes", "(proxy)"]),
+    (distill, [], DistillConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
 ])  # fmt: skip
-def test_help_shows_each_field_with_its_value_and_text(module, words, expected):
+def test_help_shows_each_field_with_its_value_and_text(module, words, schema, expected):
     said = module.help_text(words)
-    for text in expected:
+    names = {field.name for field in dataclasses.fields(schema)} - {"mixture", "weights"}
+    for text in (*expected, *names):
         assert text in said
-    schema = {run: LearnConfig, evaluate: EvaluateConfig, distill: DistillConfig}[module]
-    for field in {x.name for x in dataclasses.fields(schema)} - {"mixture", "weights"}:
-        assert field in said
-
-
-@pytest.mark.parametrize("env", preset_files.tuned("se"))
-def test_agents_learn_within_the_default_budget_of_an_se(env):
-    spec = envs.spec_of(registry.configure("env", {"name": env}))
-    for name in registry.names("agent"):
-        agent = registry.find("agent", name)
-        if agent.states == spec.states and spec.actions in agent.actions:
-            config = sejax.config([f"env={env}", f"agent={name}"])
-            longest = config.proxy.max_steps(spec.max_steps)
-            before = config.agent.steps_before_learning(longest, spec.max_steps)
-            budget = config.training.max_episodes * longest
-            budget = min(budget, config.training.max_steps or budget)
-            assert budget >= 2 * before, name
 
 
 @pytest.mark.parametrize("override", ["tracker=wandb", "tracker=tensorboard", "machines=ray"])
@@ -364,17 +288,16 @@ def test_a_package_that_is_missing_is_named_before_anything_starts(override, mon
 
 
 def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
-    program = (
-        "import os, sys\n"
-        "before = dict(os.environ)\n"
-        "import sejax\n"
-        "heavy = {'jax', 'jaxlib', 'flax', 'optax', 'numpy', 'gymnax', 'evosax', 'pandas', "
-        "'matplotlib'}\n"
-        "assert not heavy & set(sys.modules) and dict(os.environ) == before\n"
-        "sejax.config(['env=acrobot', 'es=cma_es'])\n"
-        "slow = {'gymnax.registration', 'evosax', 'torch', 'brax', 'pandas', 'matplotlib'}\n"
-        "assert not slow & set(sys.modules), slow & set(sys.modules)\n"
-        "from jax._src import xla_bridge\n"
-        "assert not xla_bridge.backends_are_initialized()\n"
-    )
+    program = """if True:
+        import os, sys
+        before = dict(os.environ)
+        import sejax
+        heavy = {"jax", "jaxlib", "flax", "optax", "numpy", "gymnax", "evosax", "pandas"}
+        assert not heavy & set(sys.modules) and dict(os.environ) == before
+        sejax.config(["env=acrobot", "es=cma_es"])
+        slow = {"gymnax.registration", "evosax", "torch", "brax", "pandas", "matplotlib"}
+        assert not slow & set(sys.modules), slow & set(sys.modules)
+        from jax._src import xla_bridge
+        assert not xla_bridge.backends_are_initialized()
+    """
     printed(sys.executable, "-c", program)

@@ -12,14 +12,11 @@ from sejax.agents.tabular import QLearningConfig, SARSAConfig, Tabular
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
-PLAIN = Tabular(
-    QLearningConfig(learning_rate=0.5, discount=0.9, epsilon_init=0.8, epsilon_decay=0.5),
-    NUM_STATES, NUM_ACTIONS,
-).agent()  # fmt: skip
+PLAIN = Tabular(QLearningConfig(learning_rate=0.5), NUM_STATES, NUM_ACTIONS).agent()
 
 
-def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTIONS, power=1.0):
-    config = CountBasedConfig(reward_scale=beta, count_power=power)
+def counting(plain=PLAIN, power=1.0, num_states=NUM_STATES, num_actions=NUM_ACTIONS):
+    config = CountBasedConfig(reward_scale=BETA, count_power=power)
     return with_count_bonus(plain, config, num_states, num_actions)
 
 
@@ -46,16 +43,16 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config, power):
 
 
 def test_beta_and_the_numbers_inside_are_traced():
-    agent = counting()
-    assert agent.hparams.agent == PLAIN.hparams and agent.hparams.reward_scale == BETA
+    hparams = counting().hparams
+    assert hparams.agent == PLAIN.hparams and hparams.reward_scale == BETA
 
     def after(beta, rate):
-        inner = agent.hparams.agent.replace(learning_rate=rate)
-        state = agent.init(KEY, agent.hparams.replace(agent=inner, reward_scale=beta))
-        return agent.update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
+        inner = hparams.agent.replace(learning_rate=rate)
+        state = counting().init(KEY, hparams.replace(agent=inner, reward_scale=beta))
+        return counting().update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
 
-    got = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
-    np.testing.assert_allclose(got, [1.0, 1.2, 1.0], rtol=1e-6)
+    values = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
+    np.testing.assert_allclose(values, [1.0, 1.2, 1.0], rtol=1e-6)
 
 
 # --- in a training -------------------------------------------------------------------------------
@@ -64,7 +61,7 @@ def test_beta_and_the_numbers_inside_are_traced():
 def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bonus():
     task = envs.make("cliff_walking")
     plain = Tabular(QLearningConfig(warmup_episodes=2), 48, 4).agent()
-    agent = counting(plain, 0.1, 48, 4)
+    agent = counting(plain, 1.0, 48, 4)
     result, test_returns = trained(agent, task, num_episodes=200, num_agents=4)
     np.testing.assert_array_equal(test_returns, -12.0)
     returns = np.asarray(result.returns)

@@ -6,7 +6,6 @@ import itertools
 import json
 import pickle
 import sys
-from pathlib import Path
 
 import gymnax
 import jax
@@ -20,11 +19,10 @@ from sejax.agents.ppo import PPOConfig
 from sejax.evaluate import evaluate, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
-from sejax.ops.files import require_writable
 from sejax.options import registry
 from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
-from sejax.runs import plots, progress
+from sejax.runs import plots
 from sejax.runs.worlds import proxy_setup
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -66,95 +64,56 @@ def room(tmp_path_factory):
     return save(tmp_path_factory.mktemp("room") / "proxy.safetensors", *ROOM_SE)
 
 
-def evaluated(*words):
-    """The mean return, rows and summary of an evaluation, which is in `out_dir`."""
-    config = evaluate_config(*words)
-    mean, folder = evaluate(config), Path(config.out_dir)
-    assert is_drawn(folder / "evaluation.png")
-    summary = json.loads((folder / "evaluation.json").read_text())
-    return mean, pd.read_csv(folder / "evaluation.csv"), summary
-
-
 def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, capsys):
-    words = f"proxy={room}", "agent=q_learning", *ROOM, f"out_dir={tmp_path}"
-    mean, table, summary = evaluated(*words)
-    assert table.groupby("world").size().to_dict() == {"the proxy": 2, "the real task": 2}
-    on_proxy, on_task = (table[table.world == world] for world in ("the proxy", "the real task"))
-    assert mean == pytest.approx(on_proxy.test_return.mean(), rel=1e-5)
-    assert (on_proxy.train_steps == 50).all()  # as the proxy was learned
-    steps = summary["the real task"]["train_steps_mean"]
-    assert steps == pytest.approx(on_task.train_steps.mean())
-    printed = capsys.readouterr().out  # in a pipe
-    assert "2 fresh q_learning agents" in printed
-    assert "training 2 agents on the proxy ...\n" in printed
-
-
-def test_several_agents_are_in_one_table(room, tmp_path, capsys):
     words = "agents=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", f"out_dir={tmp_path}"
-    mean, table, summary = evaluated(f"proxy={room}", *words, *ROOM)
+    mean = evaluate(evaluate_config(f"proxy={room}", *words, *ROOM))
+    table = pd.read_csv(tmp_path / "evaluation.csv")
     worlds, agents = ("the proxy", "the real task"), ("q_learning", "sarsa")
     counts = table.groupby(["world", "agent"]).size().to_dict()
     assert counts == dict.fromkeys(itertools.product(worlds, agents), 2)
-    assert mean == pytest.approx(table[table.world == "the proxy"].test_return.mean(), rel=1e-5)
+    on_proxy = table[table.world == "the proxy"]
+    assert mean == pytest.approx(on_proxy.test_return.mean(), rel=1e-5)
+    assert (on_proxy.train_steps == 50).all()  # as the proxy was learned
     of_sarsa = table[(table.world == "the real task") & (table.agent == "sarsa")]
+    summary = json.loads((tmp_path / "evaluation.json").read_text())
     steps = summary["the real task"]["sarsa"]["train_steps_mean"]
     assert steps == pytest.approx(of_sarsa.train_steps.mean())
     printed = capsys.readouterr().out
     assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
+    assert is_drawn(tmp_path / "evaluation.png")
 
 
-@pytest.mark.slow
-def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, monkeypatch):
-    added, add = [], progress.Tally.add
-    monkeypatch.setattr(progress.Tally, "add", lambda self: (added.append(self._total), add(self)))
-    words = f"proxy={room}", *ROOM, "agent=q_learning", "num_agents=3"
-    evaluated(*words, f"out_dir={tmp_path}/quiet")
-    assert not added
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    evaluated(*words, f"out_dir={tmp_path}/live")
-    quiet, live = (tmp_path / name / "evaluation.csv" for name in ("quiet", "live"))
-    assert live.read_bytes() == quiet.read_bytes() and added == [3] * 6
-
-
-def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr("sejax.evaluate._train_and_test", None)
-    assert refused(evaluate, evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x")) == (
-        "out_dir"
-    )
-    require_writable("out_dir", tmp_path / "a" / "b")
-    assert not (tmp_path / "a").exists()  # it leaves nothing there
+def test_one_agent_has_no_deviation_and_a_live_line_changes_no_number(
+    tmp_path, capsys, monkeypatch
+):
+    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1"
+    for folder in ("quiet", "live"):
+        evaluate(evaluate_config(*words, f"out_dir={tmp_path / folder}"))
+        printed = capsys.readouterr().out
+        assert "nan" not in printed and "1 fresh q_learning agents" in printed
+        monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
+    quiet, live = (tmp_path / folder / "evaluation.csv" for folder in ("quiet", "live"))
+    assert live.read_bytes() == quiet.read_bytes()
+    assert set(pd.read_csv(live).world) == {"the real task"}  # which alone can be evaluated
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
     then, training = proxy.learned_with("agent"), sejax.training_of(proxy)
-    assert (then.warmup_episodes, training.max_steps) == (0, 50)
-
-    def budget(agent, *then):
-        return budget_for(training, agent, then, 200, 200).max_steps
-
-    assert budget(dataclasses.replace(then, warmup_episodes=3), then) == 50 + 3 * 200
+    waits = dataclasses.replace(then, warmup_episodes=3)
     long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
-    assert budget(long, then) == 50 + 401
-    assert budget(then, then) == 50
-    assert budget(then) == 50  # nobody knows what it was learned with
-    # Of several that it was learned with, the one that waits longest counts.
-    assert budget(long, then, short) == 50 + 200
-    unlimited = paper_training()
-    assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
-    # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
-    assert budget_for(training, long, [then], 1, 200).max_steps == 50 + 401
+    for agent, learned_with, length, budget in (
+        (then, [then], 200, 50), (waits, [then], 200, 50 + 3 * 200), (long, [then], 200, 50 + 401),
+        (then, [], 200, 50),  # nobody knows what it was learned with
+        (long, [then, short], 200, 50 + 200),  # the one that waits longest counts
+        # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
+        (long, [then], 1, 50 + 401), (waits, [then], 1, 50 + 3),
+    ):  # fmt: skip
+        assert budget_for(training, agent, learned_with, length, 200).max_steps == budget
     # Of one step each: as many episodes more.
     assert budget_for(training, long, [then], 1, 200).max_episodes == training.max_episodes + 401
-    waits = dataclasses.replace(then, warmup_episodes=3)
-    assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
-
-
-def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
-    proxy = sejax.load_proxy(save(tmp_path / "proxy.safetensors", *SE[:3], "proxy.horizon=1"))
-    later = dataclasses.replace(proxy.learned_with("agent"), warmup_episodes=3)
-    assert sejax.training_of(proxy, later).max_steps == 53
+    unlimited = paper_training()
+    assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
@@ -169,9 +128,9 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     # Learned with 4000 steps, of which DDQN waits 2 * 200; others wait 10 episodes.
     waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned"))
+    as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
-    assert as_learned.worlds["the proxy"].trainings["ppo"].max_steps == 4000
+    assert proxy_setup(as_learned).worlds["the proxy"].trainings["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
@@ -184,21 +143,16 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     ("stored", "env=acrobot", "env"), ("room", "agent=ddqn", "agent"), ("real", "seed=1", "env"),
     ("real", "env=cartpole agent=q_learning", "agent"), ("nope", "seed=1", "proxy"),
     ("nope/proxy.safetensors", "seed=1", "proxy"), ("d" * 10_000, "seed=1", "proxy"),
+    ("room", "out_dir=setup.py/x", "out_dir"),
 ])  # fmt: skip
 def test_what_cannot_be_trained_is_refused_before_anything_starts(
-    proxy, words, field, stored, room, monkeypatch
+    proxy, words, field, stored, room, monkeypatch, tmp_path
 ):
+    (tmp_path / "setup.py").touch()
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
     path = {"stored": stored, "room": room}.get(proxy, proxy)
     assert refused(evaluate, evaluate_config(f"proxy={path}", *words.split())) == field
-
-
-def test_one_agent_has_no_deviation(tmp_path, capsys):
-    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1", f"out_dir={tmp_path}"
-    _, table, _ = evaluated(*words)
-    printed = capsys.readouterr().out
-    assert "nan" not in printed and "1 fresh q_learning agents" in printed
-    assert set(table.world) == {"the real task"}  # which alone can be evaluated
 
 
 @pytest.mark.parametrize(("word", "expected"), [("agent_hparams=as_learned", False),
@@ -228,7 +182,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     setup, learner = proxy_setup(config), learned(*words)[0]
-    assert (setup.agents, setup.exploration) == (learner.agents, learner.exploration)
+    assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
     assert setup.worlds["the proxy"].trainings == {"q_learning": config.real_training}
 
@@ -237,7 +191,6 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     config, proxies = learned(*ROOM_SE)[0], sejax.load_set(room)
     for group in ("agent", "exploration", "es", "objective"):
         assert proxies.learned_with(group) == getattr(config, group)
-    assert sejax.training_of(proxies) == config.training
     bare = tmp_path / "bare.safetensors"
     for stored in ({}, {"agent": {"name": "my:Agent"}}):
         sejax.save(bare, proxies.env, proxies[0].params.weights, stored)
@@ -247,22 +200,20 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
 
 def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     """Also for a stranger's task, which is not imported: what agents see is in the file."""
+    theirs = tmp_path / "theirs.safetensors"
     task = dataclasses.replace(envs.make("pendulum"), name="theirs", origin={"name": "their:Task"})
     env = paper_se(hidden_size=4, initial_state="learned", horizon=1).make(task)
-    sejax.save(tmp_path / "theirs.safetensors", env, env.init_weights(jax.random.key(0)))
-    own = "agent_hparams=default"
-    for proxy, kind in ((room, "q_learning"), (f"pendulum {own}", "td3"),
-                        (f"acrobot {own}", "ddqn"),
-                        (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
-                        ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
+    sejax.save(theirs, env, env.init_weights(jax.random.key(0)))
+    for proxy, agent in ((room, "q_learning"), ("pendulum agent_hparams=default", "td3"),
+                         (theirs, "td3"), ("nope", "ddqn"),
+                         ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
         config = evaluate_config(*f"proxy={proxy}".split())
-        assert config.agent == registry.configure("agent", {"name": kind})
+        assert config.agent == registry.configure("agent", {"name": agent})
     # An older file, which lacks that: its task's name is not imported, nor made.
-    path = tmp_path / "theirs.safetensors"
-    tensors, header = unpack(path.read_bytes(), "sejax")
+    tensors, header = unpack(theirs.read_bytes(), "sejax")
     header.pop("interface")
-    path.write_bytes(pack(tensors, "sejax", header))
-    assert evaluate_config(f"proxy={path}").agent == sejax.DDQNConfig()
+    theirs.write_bytes(pack(tensors, "sejax", header))
+    assert evaluate_config(f"proxy={theirs}").agent == sejax.DDQNConfig()
     assert "their" not in sys.modules
 
 

@@ -15,35 +15,19 @@ from sejax.ops.scores import finite_mean
 NAN, INF = np.nan, np.inf
 
 
-def numbers(*values):
-    return np.array(values, np.float32)
-
-
-def seeds(config):
-    """The numbers of the distinct keys of the population and of the incumbent, as they come."""
-    strategy = config.make(6)
-    keys = strategy.evaluations.keys(jax.random.key(0), strategy.population_size)
-    data = [jax.random.key_data(group).reshape(-1, 2) for group in keys]
-    assert [group.shape for group in keys] == [(strategy.population_size, 2), (3, 1)]
-    _, numbers = np.unique(np.concatenate(data), axis=0, return_inverse=True)
-    return numbers
-
-
-@pytest.mark.parametrize(("cls", "size"), [(NESConfig, 3), (EvosaxConfig, 4)])
-def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls, size):
-    config = cls(population_size=size, num_evals=2, num_incumbent_evals=3)
-    numbers = seeds(config)
-    assert len(np.unique(numbers)) == len(numbers)
-    # Two evaluations: seeds 0 and 1 for each candidate; the incumbent's 0, 1, 2.
-    *shared, first, second, third = seeds(dataclasses.replace(config, common_random_numbers=True))
-    assert shared == [first, second] * (len(shared) // 2) and len({first, second, third}) == 3
-
-
-@pytest.mark.parametrize("make", [NESConfig, EvosaxConfig])
-def test_a_strategy_has_the_configured_evaluations(make):
-    shared = {"num_evals": 3, "num_incumbent_evals": 5, "common_random_numbers": True}
-    config = make(population_size=4, eval_aggregate="min", **shared)
-    assert config.make(6).evaluations == Evaluations(aggregate="min", **shared)
+@pytest.mark.parametrize("cls", [NESConfig, EvosaxConfig])
+def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
+    config = cls(population_size=4, num_evals=2, num_incumbent_evals=3)
+    for shared in (False, True):
+        strategy = dataclasses.replace(config, common_random_numbers=shared).make(6)
+        size = strategy.population_size
+        population, incumbent = strategy.evaluations.keys(jax.random.key(0), size)
+        assert (population.shape, incumbent.shape) == ((size, 2), (3, 1))
+        seeds = [np.asarray(jax.random.key_data(keys)) for keys in (population, incumbent)]
+        num_seeds = len(np.unique(np.concatenate([x.reshape(-1, 2) for x in seeds]), axis=0))
+        assert num_seeds == (3 if shared else 2 * size + 3)
+        if shared:  # two for each candidate, which are the first two of the incumbent
+            np.testing.assert_array_equal(seeds[0], np.tile(seeds[1][None, :2, 0], (size, 1, 1)))
 
 
 # --- what is evaluated, and its scores -----------------------------------------------------------
@@ -58,24 +42,19 @@ def test_a_members_score_is_not_finite_if_one_evaluation_is_not(aggregate, expec
     np.testing.assert_array_equal(evaluations.population_scores(scores), expected)
 
 
-@pytest.mark.parametrize(
-    ("scores", "members", "repaired", "mean"),
-    [
-        # Nothing diverged.
-        ([1, 2, 6], [0, 9], [1, 2, 6], 3),
-        # The lowest score of the generation is a member's, -5: (1 - 5 + 10) / 3 = 2.
-        ([1, NAN, 10], [-5, 9], [1, -5, 10], 2),
-        # It is the incumbent's own, 1, where members diverged or were better: (1 + 1 + 7) / 3 = 3.
-        ([1, -INF, 7], [NAN, INF], [1, 1, 7], 3),
-        # One that no agent survived has no score, whatever the members did.
-        ([NAN, INF, -INF], [1, 2], [NAN, INF, -INF], NAN),
-        ([NAN, NAN, NAN], [NAN, NAN], [NAN, NAN, NAN], NAN),
-    ],
-)
+@pytest.mark.parametrize(("scores", "members", "repaired", "mean"), [
+    ([1, 2, 6], [0, 9], [1, 2, 6], 3),  # nothing diverged
+    # The lowest score of the generation is a member's, -5: (1 - 5 + 10) / 3 = 2.
+    ([1, NAN, 10], [-5, 9], [1, -5, 10], 2),
+    # It is the incumbent's own, 1, where members diverged or were better: (1 + 1 + 7) / 3 = 3.
+    ([1, -INF, 7], [NAN, INF], [1, 1, 7], 3),
+    # One that no agent survived has no score, whatever the members did.
+    ([NAN, INF, -INF], [1, 2], [NAN, INF, -INF], NAN),
+])  # fmt: skip
 def test_the_incumbents_agents_that_diverged_get_the_lowest_score(scores, members, repaired, mean):
-    got = Evaluations().incumbent_scores(numbers(*scores), numbers(*members))
-    np.testing.assert_array_equal(got[0], repaired)
-    np.testing.assert_array_equal(got[1], mean)
+    result = Evaluations().incumbent_scores(jnp.float32(scores), jnp.float32(members))
+    np.testing.assert_array_equal(result[0], repaired)
+    np.testing.assert_array_equal(result[1], mean)
 
 
 def test_the_finite_mean_leaves_out_what_diverged():

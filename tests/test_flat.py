@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from support import random_like, raveled, shapes_of
+from support import assert_equal, random_like, raveled, shapes_of
 
 from sejax.ops import flat
 from sejax.ops.networks import MLP
@@ -15,18 +15,12 @@ TREE = random_like(shapes_of(NET.init, jax.random.key(0), np.zeros(4)))
 
 
 def test_a_vector_of_parameters_is_turned_back_into_them():
-    unflatten = flat.unflattener(NET.init, np.zeros(4))
-
-    @jax.jit
-    def there_and_back(tree):
-        vector = flat.flatten(tree)
-        return vector, unflatten(vector)
-
-    vector, tree = there_and_back(TREE)
+    vector = jax.jit(flat.flatten)(TREE)
     assert vector.shape == (4 * 3 + 3 + 3 * 2 + 2 + 1,) and vector.dtype == jnp.float32
     np.testing.assert_array_equal(vector, raveled(TREE))
-    jax.tree.map(np.testing.assert_array_equal, tree, TREE)
+    tree = jax.jit(flat.unflattener(NET.init, np.zeros(4)))(vector)
     assert jax.tree.structure(tree) == jax.tree.structure(TREE)
+    assert_equal(tree, TREE)
 
 
 @pytest.mark.parametrize("rate", [0.1, 0.5])

@@ -11,11 +11,12 @@ NUM_STEPS, NUM_PURPOSES = 20_000, 6  # those of the trainer
 LOOPS = (0, 1, 2**31 - 1)  # seeds
 
 
-def data_of(key, step, num=NUM_PURPOSES):
-    return jnp.stack([words(k) for k in step_keys(key, step, num)])
-
-
-of_steps = jax.jit(jax.vmap(data_of, (None, 0)))
+@jax.jit
+def of_steps(key, steps):
+    """Words of a loop's steps and purposes, `[step, purpose, 2]`."""
+    return jax.vmap(lambda step: jnp.stack(list(map(words, step_keys(key, step, NUM_PURPOSES)))))(
+        steps
+    )
 
 
 @pytest.fixture(scope="module")
@@ -41,29 +42,19 @@ def plain_words(low, high, step, num):
     weyl = 0x9E3779B9
     low = plain_mix(low ^ plain_mix(step))
     high = plain_mix((high + low * weyl + step) % 2**32)
-    pairs = []
-    for purpose in range(num):
-        first, second = 2 * purpose + 1, 2 * purpose + 2
-        mixed = plain_mix((low + first * weyl) % 2**32), plain_mix((high + second * weyl) % 2**32)
-        pairs.append(mixed)
-    return pairs
+    return [
+        (plain_mix((low + (i + 1) * weyl) % 2**32), plain_mix((high + (i + 2) * weyl) % 2**32))
+        for i in range(0, 2 * num, 2)
+    ]
 
 
 @pytest.mark.parametrize("loop", [(0, 0), (1, 0), (0xDEADBEEF, 12345), (2**32 - 1, 2**32 - 1)])
 def test_keys_are_the_hash_in_plain_integers(loop):
+    assert plain_mix(1) == 0x688990C0  # by hand
     key = jax.random.wrap_key_data(jnp.array(loop, jnp.uint32))
     steps = [0, 1, 2, 199, 2**31 - 1]
-    got = of_steps(key, jnp.array(steps))
-    np.testing.assert_array_equal(
-        got, np.array([plain_words(*loop, step, NUM_PURPOSES) for step in steps], np.uint32)
-    )
-
-
-def test_the_mixing_function_by_hand():
-    # 1 * 0x7FEB352D; ^ (>> 15: 0xFFD6) = 0x7FEBCAFB; * 0x846CA68B = 0x6889F849 mod 2**32;
-    # ^ (>> 16) = 0x688990C0.
-    assert (plain_mix(0), plain_mix(1)) == (0, 0x688990C0)
-    assert len({plain_mix(x) for x in range(2**16)}) == 2**16
+    expected = [plain_words(*loop, step, NUM_PURPOSES) for step in steps]
+    np.testing.assert_array_equal(of_steps(key, jnp.array(steps)), np.array(expected, np.uint32))
 
 
 # --- statistics ----------------------------------------------------------------------------------
@@ -79,10 +70,10 @@ def test_no_two_steps_purposes_or_loops_share_a_key(drawn):
 
 def test_each_word_is_uniform(drawn):
     # Chi-square of 256 equally likely values has mean 255 and variance 510.
+    expected = NUM_STEPS / 256
     for of_word in drawn.transpose(0, 2, 3, 1).reshape(-1, NUM_STEPS):
         for shift in (0, 8, 16, 24):
             counts = np.bincount(of_word >> shift & 255, minlength=256)
-            expected = NUM_STEPS / 256
             chi_square = ((counts - expected) ** 2 / expected).sum()
             assert abs(chi_square - 255) < 5.5 * np.sqrt(510)
 
@@ -92,12 +83,9 @@ def test_each_word_is_uniform(drawn):
 
 @pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
 def test_keys_have_the_implementation_of_the_loops(impl):
-    @jax.jit
-    def draw(steps):
-        keys = jax.vmap(lambda step: jnp.stack(step_keys(jax.random.key(7, impl=impl), step, 3)))
-        return keys(steps)
-
-    keys = draw(jnp.arange(500)).reshape(-1)
+    loop = jax.random.key(7, impl=impl)
+    of_step = jax.jit(jax.vmap(lambda step: jnp.stack(step_keys(loop, step, 3))))
+    keys = of_step(jnp.arange(500)).reshape(-1)
     assert str(jax.random.key_impl(keys)) == impl
     data = np.asarray(jax.random.key_data(keys))
     assert len(np.unique(data, axis=0)) == 1500

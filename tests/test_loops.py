@@ -1,5 +1,7 @@
 """sejax.ops.loops: every element gets what it would get alone, at any depth of vmap."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,44 +35,33 @@ def assert_counted(log, number, limit):
     np.testing.assert_array_equal(log, [*range(1, limit + 1)] + [0] * (6 - limit))
 
 
-def test_a_single_loop_runs_until_it_is_inactive():
-    log, state = jax.jit(count_to)(4)
-    assert_counted(log, state.number, 4)
-    assert not state.active
+@pytest.mark.parametrize("on_gpu", [False, True])
+@pytest.mark.parametrize("shape", [(), (4,), (1, 2, 2)])
+def test_elements_that_stop_at_different_times_equal_single_loops(monkeypatch, shape, on_gpu):
+    blocks = []
 
+    def of_gpu(carry, *, cpu, default):
+        blocks.append(default)
+        return default(carry)
 
-@pytest.mark.parametrize("shape", [(4,), (2, 2), (1, 2, 2)])
-def test_elements_that_stop_at_different_times_equal_single_loops(shape):
+    if on_gpu:  # which runs blocks of steps
+        monkeypatch.setattr(jax.lax, "platform_dependent", of_gpu)
     loop = count_to
     for _ in shape:
         loop = jax.vmap(loop)
-    limits = np.int32([3, 1, 6, 2])
-    log, state = jax.jit(loop)(limits.reshape(shape))
-    log, state = jax.tree.map(np.asarray, (log, state))
-    for element, limit in enumerate([3, 1, 6, 2]):
+    limits = np.int32([3, 1, 6, 2][: math.prod(shape)])
+    log, state = jax.tree.map(np.asarray, jax.jit(loop)(limits.reshape(shape)))
+    assert not state.active.any() and bool(blocks) == (on_gpu and shape != ())
+    for element, limit in enumerate(limits):
         index = np.unravel_index(element, shape)
         assert_counted(log[index], state.number[index], limit)
-
-
-@pytest.mark.parametrize("shape", [(4,), (2, 2)])
-def test_blocks_of_steps_that_gpus_run_change_nothing(monkeypatch, shape):
-    ran = []
-
-    def on_a_gpu(carry, *, cpu, default):
-        ran.append(default)
-        return default(carry)
-
-    monkeypatch.setattr(jax.lax, "platform_dependent", on_a_gpu)
-    test_elements_that_stop_at_different_times_equal_single_loops(shape)
-    assert ran
 
 
 def test_arguments_that_all_elements_share_need_no_axis():
     loop = jax.jit(jax.vmap(count_to, in_axes=(None, 0)))
     log, state = jax.tree.map(np.asarray, loop(3, np.array([True, False, True])))
-    assert_counted(log[0], state.number[0], 3)
-    assert_counted(log[1], state.number[1], 0)  # was never active
-    assert_counted(log[2], state.number[2], 3)
+    for element, limit in enumerate((3, 0, 3)):  # one was never active
+        assert_counted(log[element], state.number[element], limit)
 
 
 def test_elements_in_a_cond_may_read_arrays_that_the_body_closes_over():

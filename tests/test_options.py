@@ -29,7 +29,6 @@ class Config(Options):
     size: int = option(4, options.counts("it is a size"))
     episodes: int = option(2, options.counts("it counts episodes", least=0))
     limit: int | None = option(None, options.counts("something must happen"))
-    window: int | None = option(8, options.counts("it is a length"))
     weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
     rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
     share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")
@@ -44,10 +43,10 @@ class Config(Options):
 
 
 @pytest.mark.parametrize(("field", "values"), [
-    ("size", [0, NAN, True, "3", None, 2**31, 1.5]), ("episodes", [-1, NAN]), ("limit", [0, "x"]),
-    ("window", [0]), ("weight", [-0.1, NAN, INF, 1e31]), ("share", [1.5, -0.5, NAN]),
-    ("rate", [0, -1, INF, NAN, 11, 5e-324, "x"]), ("goal", [INF, NAN, "low", -1e300]),
-    ("decay", [0, 1.5, NAN]), ("kind", ["fency", None, 3]),
+    ("size", [0, NAN, True, "3", None, 2**31, 1.5, np.bool_(True), np.array([3]), Fraction(3)]),
+    ("episodes", [-1, NAN]), ("limit", [0, "x"]), ("weight", [-0.1, NAN, INF, 1e31]),
+    ("share", [1.5, -0.5, NAN]), ("rate", [0, INF, NAN, 11, 5e-324, "x"]),
+    ("goal", [INF, NAN, "low", -1e300]), ("decay", [0, 1.5, NAN]), ("kind", ["fency", None, 3]),
 ])  # fmt: skip
 def test_a_value_that_breaks_its_rule_is_refused(field, values):
     for value in values:
@@ -56,25 +55,20 @@ def test_a_value_that_breaks_its_rule_is_refused(field, values):
         assert f"group.{field}=" in str(error)  # how to mend it
 
 
-def test_two_whole_messages():
-    first = refusal(Config, decay=2, share=2, size=0)  # of the fields that break their rules
-    assert str(first) == (
-        "group.size must be a whole number from 1 to 2147483647, because it is a size; got 0. "
-        "Set group.size=4."
-    )
-    assert str(refusal(Config, kind="fency")) == (
-        "group.kind must be one of fancy, plain; got 'fency'. Did you mean group.kind=fancy?"
-    )
+def test_a_whole_message():
+    error = refusal(Config, decay=2, share=2, size=0)  # of the fields that break their rules
+    rule = "must be a whole number from 1 to 2147483647, because it is a size"
+    assert str(error) == f"group.size {rule}; got 0. Set group.size=4."
 
 
-@pytest.mark.parametrize(("name", "value"), [
-    ("size", 1), ("size", 2**31 - 1), ("episodes", 0), ("limit", None), ("limit", 1),
-    ("window", None), ("window", 1), ("weight", 0), ("weight", 1e30), ("rate", 1e-30), ("rate", 10),
-    ("share", 0), ("share", 1), ("decay", 1), ("decay", 1e-6), ("goal", -3), ("kind", "fancy"),
-    ("free", -1), ("unruled", NAN),
+@pytest.mark.parametrize(("field", "values"), [
+    ("size", [1, 2**31 - 1]), ("episodes", [0]), ("limit", [None, 1]), ("weight", [0, 1e30]),
+    ("rate", [1e-30, 10]), ("share", [0, 1]), ("decay", [1, 1e-6]), ("goal", [-3]),
+    ("kind", ["fancy"]), ("free", [-1]),
 ])  # fmt: skip
-def test_a_value_at_the_edge_of_its_rule_is_taken(name, value):
-    assert getattr(Config(**{name: value}), name) == value or value != value
+def test_a_value_at_the_edge_of_its_rule_is_taken(field, values):
+    for value in values:
+        assert getattr(Config(**{field: value}), field) == value
 
 
 def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
@@ -83,23 +77,7 @@ def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
     options.check(foreign(), "mine")
 
 
-def test_options_are_frozen_and_given_by_keyword():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Config().size = 3
-    with pytest.raises(TypeError, match="positional"):
-        Config(3)
-
-
 # --- what is traced, and what is varied ----------------------------------------------------------
-
-
-def test_a_mark_that_nobody_knows_is_a_mistake_of_the_class():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Wrong(Options):
-        rate: float = option(1.0, varied="double")
-
-    with pytest.raises(ValueError, match=r"^varied must be triple, .*; got 'double'\.$"):
-        ranges_of(Wrong())
 
 
 def test_a_subclass_that_changes_a_default_keeps_rule_marks_and_help_text():
@@ -117,12 +95,8 @@ def test_numbers_of_numpy_and_jax_become_pythons():
     config = Config(size=np.int64(3), rate=np.float32(0.5), share=jnp.float32(0.25),
                     unruled=np.float64(2), limit=jnp.int32(9))  # fmt: skip
     assert config == Config(size=3, rate=0.5, share=0.25, unruled=2.0, limit=9)
-    assert {type(getattr(config, name)) for name in ("size", "limit")} == {int}
+    assert type(config.size) is type(config.limit) is int
     assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}
-    assert "got True" in str(refusal(Config, size=np.bool_(True)))
-    assert "got [3]" in str(refusal(Config, size=np.array([3])))
-    assert type(Config(rate=np.longdouble(0.5)).rate) is float
-    assert "got 3" in str(refusal(Config, size=Fraction(3)))
     key = jax.random.key(0)
     assert Config(free=key).free is key and Config(free=np.float32).free is np.float32
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_close
+from support import assert_close, assert_equal
 
 from sejax.ops.networks import MLP
 from sejax.ops.parallel import spread_groups_over_devices, spread_over_devices
@@ -18,25 +18,24 @@ def work(key, x):
 
 
 alone = jax.jit(work)
-split = jax.jit(jax.random.split, static_argnums=1)
 
 
-def assert_each_is_as_alone(got, keys, xs):
-    for i, (key, x) in enumerate(zip(keys, xs, strict=True)):
-        assert_close(jax.tree.map(lambda leaf: leaf[i], got), alone(key, x), rtol=1e-6)  # noqa: B023
+def inputs(seed, size):
+    xs = np.arange(2.0 * size, dtype=np.float32).reshape(size, 2)
+    return jax.random.split(jax.random.key(seed), size), xs
 
 
-@pytest.mark.parametrize(
-    ("num_devices", "num_parallel"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 100), (None, None)]
-)
-def test_results_come_back_in_order_for_every_size(num_devices, num_parallel):
-    for size in (1, 2, 5):
-        keys = split(jax.random.key(0), size)
-        xs = np.arange(2.0 * size, dtype=np.float32).reshape(size, 2)
-        got = jax.jit(spread_over_devices(work, num_devices, num_parallel))(keys, xs)
-        got = jax.tree.map(np.asarray, got)
-        assert got["walked"].shape == (size, 2) and got["steps"].shape == (size,)
-        assert_each_is_as_alone(got, keys, xs)
+def assert_each_is_as_alone(results, keys, xs):
+    expected = [alone(key, x) for key, x in zip(keys, xs, strict=True)]
+    assert_close(results, jax.tree.map(lambda *x: np.stack(x), *expected), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("num_devices", "num_parallel"), [(1, 3), (2, 1), (2, 100), (None, None)])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_results_come_back_in_order_for_every_size(num_devices, num_parallel, size):
+    arguments = inputs(0, size)
+    results = jax.jit(spread_over_devices(work, num_devices, num_parallel))(*arguments)
+    assert_each_is_as_alone(results, *arguments)
 
 
 NET = MLP(1, 8, 1, "tanh")
@@ -59,32 +58,23 @@ def train_network(key):
 @pytest.mark.parametrize(("size", "num_parallel"), [(5, 1), (5, 4), (2, 4)])
 def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, num_parallel):
     # Neither 5 trainings nor the shares of two devices, 3 and 1 of them, are whole batches.
-    keys = split(jax.random.key(0), size)
+    keys = jax.random.split(jax.random.key(0), size)
     one, two = (jax.jit(spread_over_devices(train_network, n, num_parallel))(keys) for n in (1, 2))
-    jax.tree.map(np.testing.assert_array_equal, one, two)
-    last = jax.tree.map(lambda x: x[-1], one)
+    assert_equal(one, two)
     by_itself = jax.jit(train_network)(keys[-1])
-    assert_close(last, by_itself, rtol=1e-4, atol=1e-6)
+    assert_close(jax.tree.map(lambda x: x[-1], one), by_itself, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("num_devices", [1, 2])
 @pytest.mark.parametrize("num_parallel", [None, 2])
 def test_groups_have_a_function_a_size_and_a_width_each(num_devices, num_parallel):
-    def scaled(x):
-        return {"scaled": 3 * x}
-
-    sizes = (5, 1, 4)
-    groups = [
-        (split(jax.random.key(i), n), np.arange(2.0 * n, dtype=np.float32).reshape(n, 2))
-        for i, n in enumerate(sizes)
-    ]
-    spread = spread_groups_over_devices(
-        [work, scaled, work], num_devices, num_parallel, [1, None, 3]
-    )
-    got = jax.jit(spread)([groups[0], (groups[1][1],), groups[2]])
-    np.testing.assert_array_equal(got[1]["scaled"], 3 * groups[1][1])
-    for group in (0, 2):
-        assert_each_is_as_alone(got[group], *groups[group])
+    first, (_, xs), last = (inputs(seed, size) for seed, size in enumerate((5, 1, 4)))
+    functions, widths = [work, lambda x: {"scaled": 3 * x}, work], [1, None, 3]
+    spread = spread_groups_over_devices(functions, num_devices, num_parallel, widths)
+    results = jax.jit(spread)([first, (xs,), last])
+    assert_each_is_as_alone(results[0], *first)
+    np.testing.assert_array_equal(results[1]["scaled"], 3 * xs)
+    assert_each_is_as_alone(results[2], *last)
 
 
 def test_two_devices_share_the_work():

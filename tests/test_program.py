@@ -20,15 +20,11 @@ MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program i
 def case():
     """The traced-at-most-once training of a tiny agent in a tiny SE, and how to call it."""
     env = registry.make("proxy", paper_se(hidden_size=4), envs.make("cartpole"))
-    config = DDQNConfig(
-        hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1, buffer_size=CAPACITY
-    )
-    agent = DDQN(config, 4, 2).agent()
+    network = {"hidden_size": 4, "num_layers": 1, "batch_size": 4}
+    agent = DDQN(DDQNConfig(**network, warmup_episodes=1, buffer_size=CAPACITY), 4, 2).agent()
     train = make_trainer(agent, env, paper_training(max_episodes=MAX_EPISODES, window=2))
-    params = env.params(env.init_weights(jax.random.key(0))).replace(
-        max_steps_in_episode=jnp.int32(5)
-    )
-    return train, agent, params
+    params = env.params(env.init_weights(jax.random.key(0)))
+    return train, agent, params.replace(max_steps_in_episode=jnp.int32(5))
 
 
 @pytest.fixture(scope="module")
@@ -62,19 +58,19 @@ def test_a_single_training_neither_copies_nor_selects_its_buffer_and_its_curve(c
 
 def test_vmapped_trainings_neither_copy_nor_select_their_buffers_and_curves(case):
     train, _, params = case
-    vmapped = jax.jit(jax.vmap(train, (0, None)))
     keys = jax.random.split(jax.random.key(0), 3)
-    assert_in_place(vmapped.lower(keys, params).compile().as_text(), MAX_EPISODES)
+    vmapped = jax.jit(jax.vmap(train, (0, None))).lower(keys, params)
+    assert_in_place(vmapped.compile().as_text(), MAX_EPISODES)
 
 
 def test_the_checker_finds_the_select_of_a_plainly_vmapped_loop():
-    def body(carry):
-        rows, step, last = carry
-        return rows.at[step % CAPACITY].set(1.0), step + 1, last
-
     def plain(last):
-        rows = jnp.zeros((CAPACITY, 11))
-        return jax.lax.while_loop(lambda c: c[1] < c[2], body, (rows, 0, last))
+        def body(carry):
+            rows, step = carry
+            return rows.at[step % CAPACITY].set(1.0), step + 1
+
+        carry = (jnp.zeros((CAPACITY, 11)), 0)
+        return jax.lax.while_loop(lambda carry: carry[1] < last, body, carry)
 
     lasts = jnp.array([3, 5, 7])
     hlo = jax.jit(jax.vmap(plain)).lower(lasts).compile().as_text()
@@ -92,8 +88,7 @@ def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     # An RN's agent of the paper has room for a million, of which its training can fill 20,000.
     task = envs.make("cartpole")
     env = RewardConfig().make(task)
-    agent = DDQN(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions).agent()
-    training = paper_training(max_episodes=100, stop_rule="never")
-    key = jax.random.key(0)
-    program = str(jax.make_jaxpr(make_trainer(agent, env, training))(key, env.default_params))
+    agent = registry.make("agent", DDQNConfig(buffer_size=1_000_000), task)
+    train = make_trainer(agent, env, paper_training(max_episodes=100, stop_rule="never"))
+    program = str(jax.make_jaxpr(train)(jax.random.key(0), env.default_params))
     assert "f32[20000," in program and "f32[1000000," not in program

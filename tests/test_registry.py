@@ -53,26 +53,16 @@ def module(tmp_path, monkeypatch, request):
 @pytest.mark.parametrize(("group", "name"), EVERY)
 def test_configure_and_describe_are_inverses(group, name):
     config = registry.configure(group, {"name": name})
-    plain = registry.describe(group, config)
-    assert registry.configure(group, plain) == config
+    assert registry.configure(group, registry.describe(group, config)) == config
     assert registry.name_of(group, config) == name
     assert type(config) is registry.find(group, name)
-    assert registry.is_registered(group, name)
-
-
-class Plain(nn.Module):
-    features: int = 8
-
-
-class Residual(Plain):
-    pass
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Torso(AgentConfig):
     """An agent's configuration that holds another dataclass, a number, a list and a function."""
 
-    torso: nn.Module = Plain()  # noqa: RUF009 (frozen)
+    torso: nn.Module = nn.Dense(8)  # noqa: RUF009 (frozen)
     rate: float = 1.0
     sizes: Any = (1, 2)
     act: Any = len
@@ -83,15 +73,14 @@ class Torso(AgentConfig):
 
 def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
     task = envs.make("cliff_walking")
-    assert sejax.make_agent(Torso(), task) is sejax.make_agent(Torso(torso=Plain(8)), task)
+    assert sejax.make_agent(Torso(), task) is sejax.make_agent(Torso(torso=nn.Dense(8)), task)
     unhashable = Torso(sizes=[1, 2])  # the same as itself alone
     first = registry.make("agent", unhashable, task)
     assert registry.make("agent", unhashable, task) is first
-    assert registry.make("agent", Torso(sizes=[1, 2]), task) is not first
     assert registry.make("agent", unhashable, envs.make("gridworld_2x2")) is not first
     variants = [
-        {}, {"torso": Residual()}, {"torso": Plain(9)}, {"torso": nn.Dense(3, dtype=np.float32)},
-        {"torso": nn.Dense(3, dtype=jnp.float16)}, {"rate": 2.0}, {"act": sum}, {"sizes": (1, 3)},
+        {}, {"torso": nn.DenseGeneral(8)}, {"torso": nn.Dense(9)}, {"rate": 2.0}, {"act": sum},
+        {"torso": nn.Dense(8, dtype=jnp.float16)}, {"sizes": [1, 2]}, {"sizes": (1, 3)},
         {"sizes": np.arange(5000)},  # too long for its repr to tell it from another
     ]  # fmt: skip
     agents = {id(sejax.make_agent(Torso(**fields), task)) for fields in variants}
@@ -101,22 +90,25 @@ def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
 # --- entry points of installed packages ----------------------------------------------------------
 
 
+MINE = """
+import dataclasses, sejax
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mine(sejax.QLearningConfig):
+    extra: int = 1
+"""
+
+
 @pytest.fixture
 def offered(module, monkeypatch):
     """A package that offers three agents: a good one, a broken one, and a `ddqn`."""
-    name = module(
-        "import dataclasses, sejax\n"
-        "@dataclasses.dataclass(frozen=True, kw_only=True)\n"
-        "class Mine(sejax.QLearningConfig):\n"
-        "    extra: int = 1\n"
-    )
-    offers = {"mine": "Mine", "broken": "Nope", "ddqn": "Mine"}.items()
-    points = [importlib.metadata.EntryPoint(k, f"{name}:{x}", "sejax.agents") for k, x in offers]
-
-    def entry_points(*, group):
-        return points if group == "sejax.agents" else []
-
-    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
+    name = module(MINE)
+    points = [
+        importlib.metadata.EntryPoint(key, f"{name}:{attribute}", "sejax.agents")
+        for key, attribute in (("mine", "Mine"), ("broken", "Nope"), ("ddqn", "Mine"))
+    ]
+    offers = {"sejax.agents": points}
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: offers.get(group, []))
     registry._offered.cache_clear()
     yield name
     registry._offered.cache_clear()
@@ -124,13 +116,10 @@ def offered(module, monkeypatch):
 
 def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(offered):
     assert registry.names("agent")[-2:] == ["mine", "broken"]
-    assert registry.is_registered("agent", "mine")
     sejax.config()  # somebody else's choice does not import it
     assert offered not in sys.modules
-    words = ["env=gridworld_2x2", "agent=mine", "agent.extra=3", "agent.discount=0.5"]
-    config = sejax.config(words)
-    assert (config.agent.extra, config.agent.discount) == (3, 0.5)
-    assert config.name("agent") == "mine"
+    config = sejax.config(["env=gridworld_2x2", "agent=mine", "agent.extra=3"])
+    assert (config.agent.extra, config.name("agent")) == (3, "mine")
     assert configuration.learn_config(configuration.plain(config)) == config
     assert registry.find("agent", "ddqn") is sejax.DDQNConfig  # a name of sejax's own stays
     assert "'Nope'" in refused("agent", "broken")
@@ -154,19 +143,13 @@ class Scaled:
 class Outer:
     Inner = Scaled
 
-def scaled(
-    task, scale: float, offset: float = 0.0, steps: tuple[int, ...] = (1, 2), also=[3], act=print
-) -> sejax.Objective:
-    assert also == [3] and act is print
+def scaled(task, scale: float, offset: float = 0.0, steps: tuple[int, ...] = (1, 2), also=[3]):
     return sejax.Objective(score=lambda outcome: scale * outcome.test_return + offset)
 
 doubled = functools.partial(scaled, scale=2.0)
 
-def unsaid(task, scale=2.0):
-    return sejax.Objective(score=lambda outcome: scale * outcome.test_return)
-
 def unknown(task, scale=2.0) -> "Unknown | Objective":
-    return unsaid(task, scale)
+    return scaled(task, scale)
 
 wrong = lambda task: 3
 too_few = lambda: 3
@@ -174,12 +157,9 @@ of_any = lambda task, *values, **more: 3
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
-    scale: float = 2.0
+    scale: "Unknown" = 2.0
 
-@dataclasses.dataclass(frozen=True)
-class Vague:
-    scale: "Unknown" = 1
-
+class Vague(Plain):
     def make(self, task):
         return None
 
@@ -194,33 +174,35 @@ def task(sizes: list[int] = [1, 2], length: float = None) -> 'sejax.Task':
 """
 
 
-def test_a_dataclass_of_ones_own_is_found_by_its_module_and_name(module):
-    name = f"{module(SEVERAL)}:Scaled"
-    config = registry.configure("objective", {"name": name, "scale": 3, "needed": 1})
-    assert config.scale == 3.0 and registry.name_of("objective", config) == name
+@pytest.mark.parametrize(("attribute", "values"), [
+    ("Scaled", {"scale": 3.0, "needed": 1}), ("Outer.Inner", {"scale": 2.0, "needed": 1}),
+    ("scaled", {"scale": 3.0, "offset": 0.0, "steps": (4,), "also": [3]}),
+    ("doubled", {"scale": 2.0}), ("unknown", {"scale": 2.0}),  # a partial; no known return type
+])  # fmt: skip
+def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
+    module, attribute, values
+):
+    name = f"{module(SEVERAL)}:{attribute}"
+    config = registry.configure("objective", {"name": name, **values})
+    assert {field: getattr(config, field) for field in values} == values
+    assert registry.name_of("objective", config) == name
     assert registry.configure("objective", registry.describe("objective", config)) == config
-    objective = registry.make("objective", config, envs.make("cartpole"))
-    assert isinstance(objective, sejax.Objective)
-    assert registry.find("objective", name.replace("Scaled", "Outer.Inner")) is type(config)
-    assert not registry.is_registered("objective", name)
-    assert "objective.needed" in refused("objective", name)
-
-
-def test_a_functions_parameters_are_its_options(module):
-    name, task = f"{module(SEVERAL)}:scaled", envs.make("cartpole")
-    config = registry.configure("objective", {"name": name, "scale": 3, "steps": [4]})
-    assert (config.scale, config.offset, config.steps, config.also) == (3.0, 0.0, (4,), [3])
-    assert registry.configure("objective", registry.describe("objective", config)) == config
+    task = envs.make("cartpole")
     objective = registry.make("objective", config, task)
     assert isinstance(objective, sejax.Objective)
     assert objective is registry.make("objective", config, task)
-    assert "objective.scale" in refused("objective", name, scale="x")
-    assert "objective.scale" in refused("objective", name, scal=1)
-    for other in ("doubled", "unsaid", "unknown"):  # a partial; what it makes may be unsaid
-        path = name.replace("scaled", other)
-        config = registry.configure("objective", {"name": path})
-        assert config.scale == 2.0 and registry.name_of("objective", config) == path
-        assert isinstance(registry.make("objective", config, task), sejax.Objective)
+
+
+@pytest.mark.parametrize(("attribute", "fields", "said"), [
+    ("Scaled", {}, "objective.needed"), ("scaled", {"scale": "x"}, "objective.scale"),
+    ("scaled", {"scal": 1}, "objective.scale"), ("a_number", {}, "a dataclass with make(task)"),
+    ("Plain", {}, "a dataclass with make(task)"), ("Outer", {}, "a dataclass with make(task)"),
+    ("too_few", {}, "must take (task, option=default, ...)"),
+    ("Vague", {"scale": 2}, "'Unknown' is not defined"), ("a_number.nope", {}, "'nope'"),
+    ("of_any", {}, "must take (task, option=default, ...)"),
+])  # fmt: skip
+def test_what_is_no_plugin_is_one_message(module, attribute, fields, said):
+    assert said in refused("objective", f"{module(SEVERAL)}:{attribute}", **fields)
 
 
 def test_parameters_are_options_of_the_command_line(module):
@@ -232,17 +214,6 @@ def test_parameters_are_options_of_the_command_line(module):
     assert registry.make("es", config.es, 2).population_size == 6
 
 
-@pytest.mark.parametrize(
-    ("attribute", "said"),
-    [("a_number", "a dataclass with make(task)"), ("Plain", "a dataclass with make(task)"),
-     ("Outer", "a dataclass with make(task)"), ("scled", ":Scaled?"), ("tasks", ":task?"),
-     ("too_few", "must take (task, option=default, ...)"), ("Vague", "'Unknown' is not defined"),
-     ("of_any", "must take (task, option=default, ...)"), ("a_number.nope", "attribute 'nope'")],
-)  # fmt: skip
-def test_what_is_no_plugin_is_one_message(module, attribute, said):
-    assert said in refused("objective", f"{module(SEVERAL)}:{attribute}", scale=2)
-
-
 def test_a_plugin_must_make_what_its_group_is_of(module):
     config = registry.configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
     error = refusal(registry.make, "objective", config, envs.make("cartpole"))
@@ -252,8 +223,9 @@ def test_a_plugin_must_make_what_its_group_is_of(module):
 def test_a_module_that_is_not_there_or_raises_is_one_message(module):
     assert "ModuleNotFoundError" in refused("agent", "no_such_module_at_all:Agent")
     said = refused("agent", f"{module('raise RuntimeError(chr(10).join([chr(120)] * 9000))')}:A")
-    assert "raised RuntimeError: x" in said
-    assert re.search(r"\(mine_\d+\.py:1: raise RuntimeError\(.*\)\)\.$", said)
+    assert re.search(
+        r"raised RuntimeError: x.*\(mine_\d+\.py:1: raise RuntimeError\(.*\)\)\.$", said
+    )
 
 
 @pytest.mark.parametrize(("typed", "meant"), [
@@ -265,21 +237,17 @@ def test_a_name_in_another_notation_is_answered_with_ours(typed, meant):
     assert meant in refused("env", typed)
 
 
-@pytest.mark.parametrize("name", ["os.path:", ":join", "a b:c", "os;x:y", "os:path-x", "1:2"])
+@pytest.mark.parametrize("name", ["os.path:", ":join", "a b:c", "os:path-x", "1:2"])
 def test_what_is_no_module_and_attribute_is_not_imported(name):
     before = set(sys.modules)
     refused("agent", name)
     assert set(sys.modules) == before
 
 
-@pytest.mark.parametrize("values", [None, 3, "ddqn", [], {}, {"discount": 0.5}])
-def test_values_without_a_name_are_refused(values):
+@pytest.mark.parametrize("values", [None, "ddqn", {}, {"discount": 0.5}, {"name": 3}, {"name": {}},
+                                    {"name": ""}, {"name": "x" * 10_000}])  # fmt: skip
+def test_values_without_a_known_name_are_refused(values):
     assert field_of(registry.configure, "agent", values) == "agent"
-
-
-@pytest.mark.parametrize("name", [None, 3, ["ddqn"], {"a": 1}, "", "x" * 10_000])
-def test_what_is_no_name_is_answered_with_the_known_ones(name):
-    assert "ddqn" in refused("agent", name)
 
 
 # --- everything of one's own ---------------------------------------------------------------------
@@ -306,16 +274,6 @@ def test_the_same_parts_as_objects_are_the_same_program(own):
         return re.sub(r"0x[0-9a-f]+", "", str(jax.make_jaxpr(learn)(jax.random.key(0))))
 
     assert program(by_objects) == program(sejax.make_learner(own))
-
-
-def test_a_task_that_says_no_discount_has_reward_networks(own):
-    env = registry.make("proxy", sejax.RewardConfig(hidden_size=2), own.task())
-    params, key = env.default_params, jax.random.key(0)
-    _, state = env.reset_env(key, params)
-    for hand, discount in ((0.0, 1.0), (2.0, 0.0)):  # the target ends the episode
-        world = state.world.replace(hand=jnp.full(2, hand), target=jnp.full(2, 2.0))
-        *_, info = env.step_env(key, state.replace(world=world), jnp.zeros(2), params)
-        assert info["discount"] == discount
 
 
 def test_parts_that_do_not_fit_are_refused(own):

@@ -1,6 +1,5 @@
 """benchmarks/torch_reference.py, the yardstick of the benchmarks: its updates are sejax's."""
 
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -9,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import paper_se, random_columns
+from support import random_columns
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.ops.networks import MLP
-from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -46,16 +44,3 @@ def test_updates_equal_sejaxs_on_the_same_batches():
     networks = (state.params, torch_state.online.values), (state.target_params, torch_state.target)
     for ours, theirs in networks:
         torch.testing.assert_close(theirs, torch_network(ours), rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize(("max_steps", "steps"), [(None, 400), (250, 250)])
-def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
-    heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
-             for name, size in reference.HEADS.items()}  # fmt: skip
-    heads["done"]["Dense_1"]["bias"] -= 10  # never
-    env = reference.SyntheticEnv(heads, paper_se(hidden_size=5))
-    training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
-    agent = dataclasses.replace(CONFIG, warmup_episodes=1)
-    result = reference.train(env, agent, training, seed=0)
-    assert result.train_steps == steps
-    assert len(result.returns) == 2

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
-from support import assert_close, paper_se, paper_training
+from support import assert_close, assert_equal, paper_se, paper_training, refused
 
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
@@ -21,7 +21,7 @@ from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.envs.wrappers import PartlyScored, PartParams
 from sejax.evaluation import make_recorder, make_tester
-from sejax.options import ConfigError, registry
+from sejax.options import registry
 from sejax.training import is_plateau, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
@@ -30,15 +30,13 @@ ENV = ScriptedEnv()
 
 
 def training(**fields):
-    return paper_training(
-        **{
-            "max_episodes": MAX_EPISODES,
-            "window": WINDOW,
-            "plateau_tolerance": TOLERANCE,
-            "time_limit_is_terminal": False,
-            **fields,
-        }
-    )
+    scripted = {
+        "max_episodes": MAX_EPISODES,
+        "window": WINDOW,
+        "plateau_tolerance": TOLERANCE,
+        "time_limit_is_terminal": False,
+    }
+    return paper_training(**scripted | fields)
 
 
 def scripted_test(key, agent_state, active):
@@ -57,44 +55,36 @@ VARIANTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def trainers():
-    """Jitted scripted trainings by variant: `(key, env_params, weight=0, active=True)`."""
+@functools.cache
+def trainer(variant):
+    """The jitted scripted training of a variant: `(key, env_params, weight=0, active=True)`."""
+    train = make_trainer(
+        scripted_agent(INIT_EPISODES), ENV, VARIANTS[variant], SOLVED, test_fn=scripted_test
+    )
+    return jax.jit(train)
 
-    def build(name, config):
-        agent = scripted_agent(INIT_EPISODES)
-        train = jax.jit(
-            make_trainer(agent, ENV, config, solved_reward=SOLVED, test_fn=scripted_test)
-        )
-        return lambda key, params, weight=0.0, active=True: train(
-            key, params, jnp.float32(weight), jnp.bool_(active)
-        )
 
-    return {name: build(name, config) for name, config in VARIANTS.items()}
+def stacked(scripts):
+    """The scripts of several lanes as one."""
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *scripts)
 
 
 def plain_training(returns, lengths, rule, min_steps=0):
-    """The paper's loop and stopping rules in plain Python: returns so far, steps, updates."""
-    history, steps, updates = [], 0, 0
-
-    def mean(values):
-        return sum(values) / len(values) if values else 0.0
-
+    """The paper's loop and stopping rules in plain Python: episodes, steps, updates."""
+    steps, updates = 0, 0
     for episode in range(MAX_EPISODES):
         length = min(lengths[episode], MAX_STEPS)
         steps += length
-        updates += length if episode >= INIT_EPISODES else 0
-        history.append(returns[episode])
-        if episode < INIT_EPISODES or steps < min_steps:
+        if episode < INIT_EPISODES:
             continue
-        newer = mean(history[-WINDOW:])
-        if rule == "solved" and newer >= SOLVED:
+        updates += length
+        history = returns[: episode + 1]
+        newer, older = np.mean(history[-WINDOW:]), np.mean(history[-2 * WINDOW : -WINDOW])
+        may_be_flat = rule == "plateau" and episode >= INIT_EPISODES + WINDOW
+        is_flat = may_be_flat and abs(newer - older) <= TOLERANCE * (abs(older) + 1e-9)
+        if steps >= min_steps and (is_flat or (rule == "solved" and newer >= SOLVED)):
             break
-        if rule == "plateau" and episode >= INIT_EPISODES + WINDOW:
-            older = mean(history[-2 * WINDOW : -WINDOW])
-            if abs(newer - older) <= TOLERANCE * (abs(older) + 1e-9):
-                break
-    return history, steps, updates
+    return episode + 1, steps, updates
 
 
 scripts = st.tuples(
@@ -110,68 +100,53 @@ scripts = st.tuples(
 @given(scripted=scripts)
 @example(scripted=([3] * 12, [1] * 12))  # flat, or solved, as soon as the rule may say so
 @example(scripted=([2**n for n in range(12)], [1] * 12))  # never flat
-def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
+def test_training_equals_a_plain_python_loop(variant, scripted):
     returns, lengths = scripted
-    rule = VARIANTS[variant].stop_rule
-    history, steps, updates = plain_training(returns, lengths, rule, VARIANTS[variant].min_steps)
-    result = trainers[variant](KEY, script(returns, lengths))
-    assert result.train_steps == steps
-    assert result.episodes == len(history)
-    expected = np.full(MAX_EPISODES, np.nan)
-    expected[: len(history)] = history
-    np.testing.assert_array_equal(result.returns, expected)
-    expected[: len(history)] = np.cumsum(np.minimum(lengths, MAX_STEPS))[: len(history)]
-    np.testing.assert_array_equal(result.episode_ends, np.nan_to_num(expected))
+    rule, min_steps = VARIANTS[variant].stop_rule, VARIANTS[variant].min_steps
+    num_episodes, steps, updates = plain_training(returns, lengths, rule, min_steps)
+    result = trainer(variant)(KEY, script(returns, lengths))
+    assert (result.train_steps, result.episodes) == (steps, num_episodes)
+    unfinished = MAX_EPISODES - num_episodes
+    ends = np.cumsum(np.minimum(lengths, MAX_STEPS))[:num_episodes]
+    np.testing.assert_array_equal(result.returns, returns[:num_episodes] + [np.nan] * unfinished)
+    np.testing.assert_array_equal(result.episode_ends, [*ends, *[0] * unfinished])
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
-    assert result.eval_steps == 0
+    assert result.eval_steps == 0 and result.test_returns is None
 
 
-def test_tests_between_episodes_decide_and_are_recorded(trainers):
-    # Test returns -1, 0, 1, 2: the mean of the last two is 1.5 after the fourth episode.
-    result = trainers["tested"](KEY, script([3] * 12, [1] * 12))
-    assert result.episodes == 4
-    np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2] + [np.nan] * 8)
-    np.testing.assert_array_equal(result.returns, [3] * 4 + [np.nan] * 8)  # as they were trained
-    assert result.eval_steps == 4 * 3
-
-
-def test_tests_between_episodes_stop_nothing_if_the_rule_does_not_ask_for_them(trainers):
-    result = trainers["watched"](KEY, script([3] * 12, [1] * 12))
-    assert result.episodes == 5  # flat from the first on: the training's own returns are judged
-    np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2, 3] + [np.nan] * 7)
-    np.testing.assert_array_equal(result.returns, [3] * 5 + [np.nan] * 7)
-    assert result.eval_steps == 5 * 3
-    assert trainers["plateau"](KEY, script([3] * 12, [1] * 12)).test_returns is None
+@pytest.mark.parametrize(("variant", "num_episodes"), [
+    ("tested", 4),  # test returns -1, 0, 1, 2: the mean of the last two is 1.5
+    ("watched", 5),  # the training's own returns are judged, flat from the first on
+])  # fmt: skip
+def test_tests_between_episodes_are_recorded_and_decide_if_the_rule_asks_for_them(
+    variant, num_episodes
+):
+    result = trainer(variant)(KEY, script([3] * 12, [1] * 12))
+    unfinished = [np.nan] * (12 - num_episodes)
+    assert result.episodes == num_episodes and result.eval_steps == num_episodes * 3
+    np.testing.assert_array_equal(result.returns, [3] * num_episodes + unfinished)
+    np.testing.assert_array_equal(result.test_returns, [*range(-1, num_episodes - 1), *unfinished])
 
 
 def test_a_solved_training_that_is_tested_throughout_goes_on():
-    solved, flat = VARIANTS["tested"], VARIANTS["plateau"]
-    assert (solved.num_tests_between, flat.num_tests_between) == (1, 0)
-    assert VARIANTS["solved"].num_tests_between == 0  # judged by its own returns
-    assert evaluation.tested_throughout(solved) == training(stop_rule="never", tests_between=1)
-    assert evaluation.tested_throughout(flat) == training(stop_rule="plateau", tests_between=1)
-    thrice = training(stop_rule="never", tests_between=3)
-    assert evaluation.tested_throughout(thrice) == thrice and thrice.num_tests_between == 3
+    numbers = {name: VARIANTS[name].num_tests_between for name in ("tested", "plateau", "solved")}
+    assert numbers == {"tested": 1, "plateau": 0, "solved": 0}
+    for rule, goes_on in (("tested", "never"), ("plateau", "plateau")):
+        throughout = evaluation.tested_throughout(VARIANTS[rule])
+        assert throughout == training(stop_rule=goes_on, tests_between=1)
 
 
-def test_a_step_budget_ends_training_within_an_episode(trainers):
-    result = trainers["cut"](KEY, script([7] * 12, [4] * 12))
-    assert result.train_steps == 17
-    assert result.episodes == 4  # the fifth is not finished and has no return
+def test_a_step_budget_ends_training_within_an_episode():
+    result = trainer("cut")(KEY, script([7] * 12, [4] * 12))
+    assert (result.train_steps, result.episodes) == (17, 4)  # the fifth has no return
     np.testing.assert_array_equal(result.returns, [7] * 4 + [np.nan] * 8)
     assert result.agent_state.num_updates == 17 - 8
 
 
-def test_all_episodes_are_trained_to_the_step_limit_of_the_params(trainers):
-    result = trainers["never"](KEY, script([1] * 12, [99] * 12, max_steps_in_episode=7))
+def test_all_episodes_are_trained_to_the_step_limit_of_the_params():
+    result = trainer("never")(KEY, script([1] * 12, [99] * 12, max_steps_in_episode=7))
     assert result.episodes == 12 and result.train_steps == 12 * 7
-
-
-def test_tests_need_a_test_function():
-    for name in ("tested", "watched"):
-        with pytest.raises(ValueError, match="test_fn"):
-            make_trainer(scripted_agent(), ENV, VARIANTS[name])
 
 
 # --- what is stored ------------------------------------------------------------------------------
@@ -186,10 +161,10 @@ def stored(result):
     return {tuple(float(c[i]) for c in columns) for i in range(batch.reward.size)}
 
 
-def test_the_replay_holds_what_happened_with_the_true_last_observations(trainers):
+def test_the_replay_holds_what_happened_with_the_true_last_observations():
     # Lengths 2 and 3 terminate, 6 is cut by the limit of 4 and bootstraps.
     lengths = [2, 3, 6] * 4
-    result = trainers["never"](KEY, script(range(12), lengths))
+    result = trainer("never")(KEY, script(range(12), lengths))
     expected = set()
     for episode, length in enumerate(lengths):
         for t in range(min(length, MAX_STEPS)):
@@ -204,35 +179,33 @@ def test_the_replay_holds_what_happened_with_the_true_last_observations(trainers
     assert 0.0 in {discount for *_, discount, _ in rows}
 
 
-def test_each_episode_starts_from_a_fresh_reset(trainers):
-    result = trainers["never"](KEY, script([0] * 12, [1] * 12))
-    batch = result.agent_state.batch
-    tags = {int(a) // WHO: float(tag) for a, tag in zip(batch.action, batch.obs[1], strict=True)}
-    assert len(tags) > 8 and len(set(tags.values())) == len(tags)
+def test_each_episode_starts_from_a_fresh_reset():
+    batch = trainer("never")(KEY, script([0] * 12, [1] * 12)).agent_state.batch
+    episodes = np.unique(batch.action // WHO)
+    assert 8 < len(episodes) == len(np.unique(batch.obs[1]))  # tags
 
 
-def test_a_time_limit_bootstraps_unless_it_is_asked_to_be_terminal(trainers):
+def test_a_time_limit_bootstraps_unless_it_is_asked_to_be_terminal():
     params = script([0] * 12, [99] * 12)  # no episode terminates
-    assert trainers["never"](KEY, params).agent_state.min_discount == 1.0
-    assert trainers["cut"](KEY, params).agent_state.min_discount == 0.0
-    result = trainers["cut"](KEY, params)
+    assert trainer("never")(KEY, params).agent_state.min_discount == 1.0
+    result = trainer("cut")(KEY, params)
+    assert result.agent_state.min_discount == 0.0
     assert {d for _, t, _, d, _ in stored(result) if t < MAX_STEPS - 1} == {1.0}
 
 
 # --- trainings that go wrong ---------------------------------------------------------------------
 
 
-def test_a_number_that_is_not_finite_stops_training_and_is_flagged(trainers):
-    result = trainers["never"](KEY, script([5] * 12, [3] * 12, nonfinite_episode=2))
+def test_a_number_that_is_not_finite_stops_training_and_is_flagged():
+    result = trainer("never")(KEY, script([5] * 12, [3] * 12, nonfinite_episode=2))
     assert result.nonfinite
     assert result.train_steps == 3 + 3 + 2 and result.episodes == 3
 
 
-def test_weights_that_are_not_finite_are_flagged(trainers):
-    params = script([5] * 12, [3] * 12)
-    assert trainers["never"](KEY, params, jnp.nan).nonfinite
-    assert trainers["never"](KEY, params, jnp.inf).nonfinite
-    assert not trainers["never"](KEY, params, 1.0).nonfinite
+@pytest.mark.parametrize("weight", [1.0, jnp.nan, jnp.inf])
+def test_weights_that_are_not_finite_are_flagged(weight):
+    result = trainer("never")(KEY, script([5] * 12, [3] * 12), weight)
+    assert result.nonfinite == (weight != 1.0)
 
 
 # --- the stopping rules by hand ------------------------------------------------------------------
@@ -242,26 +215,17 @@ def test_weights_that_are_not_finite_are_flagged(trainers):
     ("recent", "num_episodes", "flat"),
     [
         # Windows of 2, tolerance 1 %. Older mean 100: newer may be 99 to 101.
-        ([99, 101, 100, 100], 4, True),
         ([100, 100, 100.5, 101.3], 4, True),  # newer 100.9
         ([100, 100, 101, 101.4], 4, False),  # newer 101.2
         ([-100, -100, -100.4, -101.2], 9, True),  # relative to the magnitude: 0.8 of 1
-        ([-100, -100, -101, -101.4], 9, False),
         ([50, -50, 0, 0], 4, True),  # older 0, newer 0
         ([50, -50, 0, 0.1], 4, False),  # older 0: nothing but 0 is close
         # Three episodes 5, 5, 5: the older window holds one of them, whose mean is 5.
         ([0, 5, 5, 5], 3, True),
         ([0, 4, 5, 5], 3, False),
-        # Two episodes: the older window is empty and has mean 0.
-        ([0, 0, 5, 5], 2, False),
-        ([0, 0, 3, -3], 2, True),
         # One episode: newer is its return, older 0.
         ([0, 0, 0, 5], 1, False),
-        ([0, 0, 0, 0], 1, True),
-        # Windows of 3: older (1 + 2 + 3) / 3 = 2, newer (3 + 2 + 1) / 3 = 2.
-        ([1, 2, 3, 3, 2, 1], 6, True),
-        # Five episodes: older (2 + 3) / 2 = 2.5, newer 2; and (2.01 + 2) / 2 = 2.005.
-        ([0, 2, 3, 3, 2, 1], 5, False),
+        # Windows of 3, five episodes: older (2.01 + 2) / 2 = 2.005, newer 2.
         ([0, 2.01, 2, 3, 2, 1], 5, True),
         ([1, 1, 1, np.nan], 4, False),
     ],
@@ -301,42 +265,22 @@ def test_the_world_sees_what_the_agent_means_and_the_memory_what_it_did():
     np.testing.assert_array_equal(tests.num_steps, [3, 3])
 
 
-def test_an_agent_without_weights_trains_too():
-    agent = dataclasses.replace(
-        scripted_agent(), init=lambda key, hparams: jnp.int32(0), update=lambda key, state, batch:
-        state, begin_episode=lambda state, episode: jnp.int32(episode),
-        act=lambda key, state, obs, explore: WHO * state + obs[0].astype(jnp.int32),
-    )  # fmt: skip
-    result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([1] * 12, [2] * 12))
-    assert result.train_steps == 24 and not result.nonfinite
-
-
 # --- lanes ---------------------------------------------------------------------------------------
 
 
-def assert_same(many, index, alone):
-    """A lane's result and that of the training alone: counts equal, numbers up to rounding."""
-    lane = jax.tree.map(lambda x: x[index], many)
-    assert lane.train_steps == alone.train_steps
-    assert lane.episodes == alone.episodes
-    assert lane.eval_steps == alone.eval_steps
-    assert lane.nonfinite == alone.nonfinite
-    assert_close(lane, alone, rtol=1e-3, atol=1e-4)
-
-
+@functools.cache
 def scripted_lanes():
     """Keys, params, weights and whether they run, of six trainings: `[lane, ...]`."""
     rng = np.random.default_rng(0)
-    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(5)]
-    each.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
-    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
+    scripts = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(5)]
+    scripts.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
     active = jnp.array([True, True, False, True, True, True])
-    return jax.random.split(KEY, 6), params, jnp.arange(6.0), active
+    return jax.random.split(KEY, 6), stacked(scripts), jnp.arange(6.0), active
 
 
 @pytest.mark.parametrize(("variant", "shape"), [("plateau", (6,)), ("tested", (2, 3))])
-def test_lanes_equal_single_trainings(trainers, variant, shape):
-    train = in_lanes = trainers[variant]
+def test_lanes_equal_single_trainings(variant, shape):
+    train = in_lanes = trainer(variant)
     for _ in shape:
         in_lanes = jax.vmap(in_lanes)
     lanes = scripted_lanes()
@@ -344,7 +288,8 @@ def test_lanes_equal_single_trainings(trainers, variant, shape):
     many = jax.tree.map(lambda x: x.reshape(6, *x.shape[len(shape) :]), many)
     assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
     for i in range(6):
-        assert_same(many, i, train(*jax.tree.map(lambda x, i=i: x[i], lanes)))
+        lane, alone = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (many, lanes))
+        assert_close(lane, train(*alone), rtol=1e-4, atol=1e-4)
 
 
 def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
@@ -367,8 +312,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
     )
     config = training(stop_rule="never", max_steps=24, tests_between=1)
     train = make_trainer(agent, ENV, config, test_fn=tested)
-    each = [script([1] * 12, [length] * 12) for length in (1, 2)]  # 12 steps, then waits; 24
-    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
+    params = stacked([script([1] * 12, [length] * 12) for length in (1, 2)])  # 12 steps; 24
     result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params)
     jax.effects_barrier()
     np.testing.assert_array_equal(result.train_steps, [12, 24])
@@ -379,36 +323,34 @@ def test_a_time_limit_is_never_terminal_in_an_se():
     """As programs; what they do on a real task is above."""
     env = paper_se(hidden_size=4).make(envs.make("cartpole"))
     agent = DDQN(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4), 4, 2).agent()
-    trainings = [training(stop_rule="never", time_limit_is_terminal=x) for x in (False, True)]
-    without, asked = (
-        re.sub("0x[0-9a-f]+", "", str(jax.make_jaxpr(train)(KEY, env.default_params)))
-        for train in (make_trainer(agent, env, config) for config in trainings)
-    )
-    assert without == asked
+    programs = set()
+    for is_terminal in (False, True):
+        train = make_trainer(agent, env, training(time_limit_is_terminal=is_terminal))
+        program = str(jax.make_jaxpr(train)(KEY, env.default_params))
+        programs.add(re.sub("0x[0-9a-f]+", "", program))
+    assert len(programs) == 1
 
 
 # --- the test on the real task -------------------------------------------------------------------
 
 
 def test_the_tester_equals_greedy_episodes_in_gymnasium():
-    task = envs.make("cartpole")
+    task, key = envs.make("cartpole"), jax.random.key(3)
     agent = DDQN(DDQNConfig(hidden_size=8, num_layers=1), 4, 2).agent()
     state = agent.init(jax.random.key(2), agent.hparams)
-    key = jax.random.key(3)
     returns, steps, _ = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)
-    assert returns.shape == (6,) and steps.shape == (6,)
-    reference = gymnasium.make("CartPole-v1").unwrapped
+    assert returns.shape == steps.shape == (6,)
+    reference = gymnasium.make("CartPole-v1", max_episode_steps=200)
     greedy = jax.jit(lambda obs: agent.act(key, state, obs, explore=False))
     for i, key_episode in enumerate(jax.random.split(key, 6)):
-        key_reset, _ = jax.random.split(key_episode)
-        obs, _ = task.env.reset_env(key_reset, task.params)
+        obs, _ = task.env.reset_env(jax.random.split(key_episode)[0], task.params)
         reference.reset(seed=0)
-        reference.state = np.array(obs, np.float64)
+        reference.unwrapped.state = np.array(obs, np.float64)
         total, num_steps, ended = 0.0, 0, False
         while not ended:
-            obs, reward, terminated, _, _ = reference.step(int(greedy(jnp.float32(obs))))
+            obs, reward, terminated, truncated, _ = reference.step(int(greedy(jnp.float32(obs))))
             total, num_steps = total + reward, num_steps + 1
-            ended = terminated or num_steps == 200
+            ended = terminated or truncated
         assert (returns[i], steps[i]) == (total, num_steps)
     assert len(set(np.asarray(steps).tolist())) > 1  # different initial states
 
@@ -429,18 +371,11 @@ def row_recorder(example, max_steps):
     return Buffer(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
 
 
-@pytest.fixture(scope="module")
-def recorded():
-    """Scripted trainings of 12 and of 5 episodes in lanes, with a recorder: `[lane]`."""
+def test_a_recorder_is_handed_every_step_and_none_after_the_last():
     config = training(stop_rule="plateau", max_steps=100)
     train = make_trainer(scripted_agent(INIT_EPISODES), ENV, config, recorder=row_recorder)
-    each = [script(range(12), LENGTHS), script([3] * 12, LENGTHS)]
-    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
-    return each, jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params, jnp.zeros(2))
-
-
-def test_a_recorder_is_handed_every_step_and_none_after_the_last(recorded):
-    _, result = recorded
+    params = stacked([script(returns, LENGTHS) for returns in (range(12), [3] * 12)])
+    result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params, jnp.zeros(2))
     for lane, num_episodes in ((0, 12), (1, 5)):
         expected = [
             (episode, time, time + 1 == min(LENGTHS[episode], MAX_STEPS))
@@ -459,34 +394,26 @@ def scripted_task(length):
 
 
 def scripted_state():
-    agent = scripted_agent()
-    return agent.begin_episode(agent.init(KEY, 0.0), 0)
+    return scripted_agent().init(KEY, 0.0).replace(episode=jnp.int32(0))
 
 
-def partly_scored(agent, num_episodes):
-    """Tests in which so many steps are scored as their params say."""
-    task = scripted_task(99)
-    return make_tester(agent, task, num_episodes, lambda env: PartlyScored(env, task.params))
-
-
-def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
+@pytest.mark.parametrize(("repeat", "scored_steps", "scored", "num_steps"), [
     # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in the last one.
-    test = jax.jit(partly_scored(scripted_agent(), 2))
-    for scored_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
-        tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(scored_steps)))
-        np.testing.assert_array_equal(tests.scored, [scored] * 2)
-        np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
-        np.testing.assert_array_equal(tests.num_steps, [played] * 2)
-    tests = test(KEY, scripted_state(), False, PartParams(scored_steps=jnp.int32(4)))
-    assert not tests.returns.any() and not tests.num_steps.any()  # do not begin
-
-
-def test_actions_are_repeated_beyond_the_tasks_limit_too():
-    # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
-    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
-    test = partly_scored(agent, 1)
-    tests = test(KEY, scripted_state(), True, PartParams(scored_steps=jnp.int32(9)))
-    assert tests.num_steps == 9 and tests.returns == 2.5
+    (1, 3, 0.0, 4), (1, 4, 2.5, 4), (1, 6, 5.0, 6),
+    (3, 9, 5.0, 9),  # decisions of 3 and 1 steps, then of 3 and 2
+])  # fmt: skip
+def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored(
+    repeat, scored_steps, scored, num_steps
+):
+    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=repeat))
+    task = scripted_task(99)
+    test = jax.jit(make_tester(agent, task, 2, lambda env: PartlyScored(env, task.params)))
+    params = PartParams(scored_steps=jnp.int32(scored_steps))
+    tests = test(KEY, scripted_state(), True, params)
+    # Returns are of the task's own 4 steps.
+    assert_equal(tests, [np.full(2, number) for number in (2.5, num_steps, scored)])
+    not_begun = test(KEY, scripted_state(), False, params)
+    assert not not_begun.returns.any() and not not_begun.num_steps.any()
 
 
 def test_recorded_tests_are_the_tests():
@@ -515,25 +442,19 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     task = envs.make("cartpole")
     agent = registry.make("agent", DDQNConfig(warmup_episodes=1), task)
     env = paper_se(initial_state="learned", horizon=1).make(task)
-    asked = paper_training(max_steps=4000, stop_rule="never")
-    with pytest.raises(ConfigError, match=r"Set training\.max_episodes=4000\.$") as error:
-        make_trainer(agent, env, asked)
-    assert error.value.field == "training.max_episodes"
-    assert make_trainer(agent, env, dataclasses.replace(asked, max_episodes=4000))
-    assert make_trainer(agent, env, dataclasses.replace(asked, stop_rule="plateau"))  # a bound
-    assert make_trainer(agent, task.env, asked)  # whose params may allow any length
+    config = paper_training(max_steps=4000, stop_rule="never")
+    assert refused(make_trainer, agent, env, config) == "training.max_episodes"
+    assert make_trainer(agent, env, dataclasses.replace(config, max_episodes=4000))
+    assert make_trainer(agent, env, dataclasses.replace(config, stop_rule="plateau"))  # a bound
+    assert make_trainer(agent, task.env, config)  # whose params may allow any length
 
 
 @pytest.mark.parametrize("make, field", [
     (lambda agent, task: make_trainer(task.env, agent), "agent"),
-    (lambda agent, task: make_trainer(agent, (task.env, task.params)), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
-    (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, paper_training()),
-     "task"),
+    (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, training()), "task"),
     (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),
 ])  # fmt: skip
 def test_arguments_of_other_kinds_are_refused(make, field):
     task = envs.make("gridworld_2x2")
-    with pytest.raises(ConfigError) as error:
-        make(registry.make("agent", QLearningConfig(), task), task)
-    assert error.value.field == field
+    assert refused(make, registry.make("agent", QLearningConfig(), task), task) == field
