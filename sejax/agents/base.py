@@ -4,18 +4,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import jax
-from flax import linen as nn
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.spec import Discrete
-from sejax.ops.networks import OnImages
-from sejax.options import Options, counts, one_of, option, require, traced_options
+from sejax.options import Options, counts, option, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -232,6 +230,7 @@ class AgentOptions(AgentConfig):
 
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
+    removed: ClassVar[dict[str, Any]] = {"torso": None, "num_filters": 16}
 
     warmup_episodes: int = option(1, counts("it counts episodes", least=0))
 
@@ -241,47 +240,6 @@ class AgentOptions(AgentConfig):
     def spec(self) -> AgentSpec:
         """The spec of an agent that learns once it has warmed up."""
         return AgentSpec(warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorsoOptions(AgentOptions):
-    """What agents share that can see images.
-
-    Attributes:
-      torso: what comes before the hidden layers
-      num_filters: of torso=conv, each of 3 x 3 pixels
-    """
-
-    torso: str | None = option(None, one_of(("conv",)))
-    num_filters: int = option(16, counts())
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.torso is not None or self.num_filters == type(self).num_filters,
-            "agent.num_filters",
-            f"must be left out without a torso; got {self.num_filters}. Set agent.torso=conv.",
-        )
-
-    def with_torso(self, network: nn.Module, image: tuple[int, ...]) -> nn.Module:
-        """The network behind the torso.
-
-        Args:
-          network: of the hidden layers and the outputs.
-          image: rows, columns and channels of the observations; empty if they are no images.
-
-        Raises:
-          ConfigError: for a torso for images where there are none.
-        """
-        if self.torso is None:
-            return network
-        require(
-            len(image) == 3 and min(image[:2]) >= 3,
-            "agent.torso",
-            "must be null unless observations are images of rows, columns and channels, at least 3 "
-            f"x 3 pixels; got {self.torso}. Set agent.torso=null.",
-        )
-        return OnImages(image, self.num_filters, network)
 
 
 @dataclass(frozen=True, kw_only=True)

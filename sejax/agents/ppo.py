@@ -25,7 +25,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, Learner, TorsoOptions
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
@@ -54,7 +54,7 @@ _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig(TorsoOptions):
+class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions.
 
     The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
@@ -124,9 +124,9 @@ class PPOConfig(TorsoOptions):
         """The agent for a task's observations and actions."""
         length = self.rollout_length(task.max_steps)
         if task.num_actions is not None:
-            return PPO(self, task.obs_dim, task.num_actions, length, task.image).agent()
+            return PPO(self, task.obs_dim, task.num_actions, length).agent()
         sizes = task.obs_dim, task.action_dim, length
-        return ContinuousPPO(self, *sizes, task.image, task.max_action).agent()
+        return ContinuousPPO(self, *sizes, task.max_action).agent()
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -193,7 +193,6 @@ class PPO(Learner):
       obs_dim: length of an observation.
       action_dim: number of actions, or the length of a continuous one: outputs of the actor.
       length: decisions between two learning phases.
-      image: rows, columns and channels of observations that are images, for a torso.
       max_action: the largest continuous action; None for discrete ones.
 
     Raises:
@@ -214,7 +213,6 @@ class PPO(Learner):
         obs_dim: int,
         action_dim: int,
         length: int,
-        image: tuple[int, ...] = (),
         max_action: float | None = None,
     ):
         require(
@@ -227,8 +225,7 @@ class PPO(Learner):
         self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
         shape = (config.hidden_size, config.num_layers, config.activation)
         self.actor, self.critic = (
-            config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)
-            for size in (action_dim, 1)
+            MLP(size, *shape, learn_prelu_slope=True) for size in (action_dim, 1)
         )
         self.optimizer = config.optimizer()
         template = jax.eval_shape(self.init_tree, jax.random.key(0))

@@ -183,7 +183,7 @@ class Options:
     """
 
     group: ClassVar[str] = ""
-    removed: ClassVar[tuple[tuple[str, Any], ...]] = ()
+    removed: ClassVar[dict[str, Any]] = {}
 
     def __post_init__(self) -> None:
         check(self, self.group)
