@@ -23,7 +23,6 @@ from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import LARGEST, require
 from sejax.options.parts import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer
@@ -201,8 +200,7 @@ def make_evaluator(
       test_env: as of `make_tester`, for the test after the training.
 
     Raises:
-      ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
-        training.
+      ConfigError: for arguments of other kinds.
 
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
 
@@ -215,7 +213,8 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-    _require_evaluation(task, training)
+    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_part("training", TrainingConfig, training)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)
@@ -247,20 +246,6 @@ def make_evaluator(
     run = agent.fresh(make_run)
     return lambda key, env_params, active=True, test_params=None: run(
         key, env_params, active, test_params
-    )
-
-
-def _require_evaluation(task: Task, training: TrainingConfig) -> None:
-    """Checks what tests need: a task whose episodes end within a bearable time."""
-    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
-    require_part("training", TrainingConfig, training)
-    budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
-    require(
-        task.max_steps <= 1000 * budget,
-        "env.max_steps",
-        f"must end a test episode within 1,000 times the training budget of {training.max_steps} "
-        f"steps, because an agent may never end it; got {task.max_steps:,} for {task.name}. Set "
-        "env.max_steps=N, or Task(max_steps=N).",
     )
 
 
@@ -332,7 +317,6 @@ def evaluate_agents(
     keys: Array,
     num_parallel: int | None = None,
     devices: int | None = None,
-    on_done: Callable[[], None] | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
@@ -340,13 +324,9 @@ def evaluate_agents(
     arguments; `env_params` may differ, and `keys` in their values. The numbers are those of
     `jax.vmap(make_evaluator(...))` up to rounding: a program of another width adds in another
     order, and in a training a last bit grows.
-
-    `on_done` is called from the program's threads as each agent ends, also for copies that fill up
-    the last batch. The numbers are the same with it, but it compiles for each such function, and
-    jax keeps no program on disk that calls back.
     """
     env = env.bare if isinstance(env, ProxyEnv) else env
-    program = _evaluation_program(agent, env, task, training, num_parallel, devices, on_done)
+    program = _evaluation_program(agent, env, task, training, num_parallel, devices)
     return program(keys, env_params)
 
 
@@ -358,17 +338,13 @@ def _evaluation_program(
     training: TrainingConfig,
     num_parallel: int | None,
     devices: int | None,
-    on_done: Callable[[], None] | None,
 ) -> Callable[[Array, PyTree], Outcome]:
     """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
     evaluate = make_evaluator(agent, env, task, training)
 
     def program(keys: Array, env_params: PyTree) -> Outcome:
         def one(key: Array) -> Outcome:
-            outcome: Outcome = evaluate(key, env_params)
-            if on_done is not None:
-                jax.debug.callback(lambda _: on_done(), outcome.test_return)
-            return outcome
+            return evaluate(key, env_params)
 
         width = num_parallel_on_cpu(agent, training)
         if width is not None:

@@ -14,17 +14,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentState, Hparams, Spaces
+from sejax.agents.base import Agent, AgentState, Hparams, sizes_of
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
-from sejax.envs.environment import Environment
+from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.options import (
     LARGEST,
     Options,
-    as_text,
     counts,
     not_negative,
     one_of,
@@ -37,17 +36,6 @@ from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
-
-# Modes of jax in which programs of sejax fail: values that they may have, and why no others.
-MODES: dict[str, tuple[tuple[object, ...], str]] = {
-    "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
-    "jax_debug_nans": ((False,), "what has not happened is nan, and a training may diverge"),
-    "jax_debug_infs": ((False,), "the score before the first is minus infinity"),
-    "jax_debug_key_reuse": ((False,), "the state of a run that has ended keeps its key"),
-    "jax_numpy_rank_promotion": (("allow", "warn"), "operands are broadcast"),
-    "jax_numpy_dtype_promotion": (("standard",), "numbers of several types are combined"),
-    "jax_transfer_guard": (("allow", None, "log"), "numbers of Python are moved to devices"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,16 +87,14 @@ class TrainingConfig(Options):
         return max(self.tests_between, int(self.stops_by_tests))
 
 
-def require_modes() -> None:
-    """Checks that jax is in no mode in which programs of sejax fail.
+def require_32_bits() -> None:
+    """Checks that jax computes in 32 bits, as programs of sejax do.
 
     Raises:
-      ConfigError: of the mode, such as `jax_enable_x64`.
+      ConfigError: of `jax_enable_x64`.
     """
-    for mode, (allowed, reason) in MODES.items():
-        got = getattr(jax.config, mode)
-        off = f"Set {mode.upper()}={as_text(allowed[0])}."
-        require(got in allowed, mode, f"must be {as_text(allowed[0])}: {reason}; got {got}. {off}")
+    message = "must be false, as sejax computes in 32 bits; got true. Set JAX_ENABLE_X64=false."
+    require(not jax.config.jax_enable_x64, "jax_enable_x64", message)
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
@@ -235,19 +221,16 @@ def make_trainer(
       (8, 20)
     """
     require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
-    fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
-    must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
-    require(hasattr(env, "step_env"), "env", must)
     require_own_steps(env)
-    spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
+    sizes = sizes_of(*spaces_of(env))
     require(
-        agent.spec.spaces == spaces,
+        agent.spec.sizes in (None, sizes),
         "agent",
-        f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
+        f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}. "
         "Set agent=sejax.make_agent(config, task) with that task.",
     )
     require_part("training", TrainingConfig, training)
-    require_modes()
+    require_32_bits()
     if training.num_tests_between and test_fn is None:
         raise ValueError(
             f"tests after each episode (training.num_tests_between is "

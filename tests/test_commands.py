@@ -61,14 +61,11 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path, monkeypatch, cap
 # --- what people type ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("words", "meant"), [
-    (["--env", "cartpole"], "env=cartpole."), (["--env=cartpole", "seed=1"], "env=cartpole."),
-    (["-agent"], "agent=VALUE."), (["--seed", "env=cartpole"], "seed=VALUE."),
-])  # fmt: skip
-def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words, meant):
+@pytest.mark.parametrize("words", [["--env", "cartpole"], ["--env=cartpole"], ["-agent"]])
+def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words):
     main = functools.partial(commands.start, sejax.config, str)
     status, _, said = ended(monkeypatch, capsys, main, *words)
-    assert status == commands.BAD_INPUT and said.count("\n") == 1 and f"Write {meant}" in said
+    assert status == commands.BAD_INPUT and said.count("\n") == 1 and "Write env=cartpole" in said
 
 
 @pytest.mark.parametrize("words", [[], ["--help"]])
@@ -143,20 +140,10 @@ def test_a_platform_that_jax_lacks_is_one_line_with_the_variable(tmp_path):
     assert last.startswith("error: JAX_PLATFORMS must") and last.endswith("JAX_PLATFORMS=cpu.")
 
 
-@pytest.mark.parametrize(
-    ("mode", "value"),
-    [("jax_debug_nans", True), ("jax_debug_infs", True), ("jax_debug_key_reuse", True),
-     ("jax_enable_x64", True), ("jax_disable_jit", True), ("jax_transfer_guard", "disallow"),
-     ("jax_numpy_rank_promotion", "raise"), ("jax_numpy_dtype_promotion", "strict")],
-)  # fmt: skip
-def test_a_mode_of_jax_that_cannot_be_is_one_line_with_its_name(mode, value):
-    before = getattr(jax.config, mode)
-    jax.config.update(mode, value)
-    try:
+def test_64_bits_are_refused_with_one_line():
+    with jax.enable_x64(True):
         error = refusal(runtime.configure_jax)
-    finally:
-        jax.config.update(mode, before)
-    assert error.field == mode and f"Set {mode.upper()}=" in str(error)
+    assert error.field == "jax_enable_x64" and "Set JAX_ENABLE_X64=false." in str(error)
 
 
 def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):

@@ -4,27 +4,24 @@ import dataclasses
 import functools
 import itertools
 import json
-import pickle
 import sys
 from pathlib import Path
 
-import gymnax
 import jax
 import pandas as pd
 import pytest
-from support import is_drawn, paper_se, paper_training, refusal, refused
+from support import is_drawn, paper_se, paper_training, refused
 
 import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
 from sejax.evaluate import evaluate, summarise
-from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.ops.files import require_writable
 from sejax.options import registry
 from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
-from sejax.runs import plots, progress
+from sejax.runs import plots
 from sejax.runs.worlds import proxy_setup
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -101,19 +98,6 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
     assert steps == pytest.approx(of_sarsa.train_steps.mean())
     printed = capsys.readouterr().out
     assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
-
-
-@pytest.mark.slow
-def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, monkeypatch):
-    added, add = [], progress.Tally.add
-    monkeypatch.setattr(progress.Tally, "add", lambda self: (added.append(self._total), add(self)))
-    words = f"proxy={room}", *ROOM, "agent=q_learning", "num_agents=3"
-    evaluated(*words, f"out_dir={tmp_path}/quiet")
-    assert not added
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    evaluated(*words, f"out_dir={tmp_path}/live")
-    quiet, live = (tmp_path / name / "evaluation.csv" for name in ("quiet", "live"))
-    assert live.read_bytes() == quiet.read_bytes() and added == [3] * 6
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
@@ -271,21 +255,6 @@ def test_an_evaluations_mean_leaves_no_agent_out():
         False, True, False], "train_steps": 5, "train_episodes": 1})  # fmt: skip
     row = summarise(agents, ["world"]).loc["w"]
     assert (row["test_return_mean"], row["num_nonfinite"]) == (-10.0, 1)
-
-
-def test_a_test_that_may_never_end_is_refused_beside_the_training_budget():
-    env = gymnax.make("Pendulum-v1")[0]
-    task = sejax.Task(name="endless", env=env, max_steps=1_000_000_000)
-    agent = sejax.make_agent(sejax.TD3Config(), task)
-    training = sejax.TrainingConfig(max_steps=60, max_episodes=60)
-    error = refusal(make_evaluator, agent, env, task, training)
-    assert error.field == "env.max_steps" and "of 60 steps" in str(error)
-
-
-def test_pickling_an_agent_says_what_to_send_in_its_place():
-    agent = sejax.make_agent(sejax.DDQNConfig(hidden_size=4), sejax.envs.make("cartpole"))
-    with pytest.raises(TypeError, match="Send its configuration"):
-        pickle.dumps(agent)
 
 
 def test_pictures_have_a_title_and_a_panel_for_each_number(tmp_path, monkeypatch):

@@ -121,7 +121,6 @@ def test_numbers_of_numpy_and_jax_become_pythons():
     assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}
     assert "got True" in str(refusal(Config, size=np.bool_(True)))
     assert "got [3]" in str(refusal(Config, size=np.array([3])))
-    assert type(Config(rate=np.longdouble(0.5)).rate) is float
     assert "got 3" in str(refusal(Config, size=Fraction(3)))
     key = jax.random.key(0)
     assert Config(free=key).free is key and Config(free=np.float32).free is np.float32

@@ -235,7 +235,7 @@ def test_parameters_are_options_of_the_command_line(module):
 @pytest.mark.parametrize(
     ("attribute", "said"),
     [("a_number", "a dataclass with make(task)"), ("Plain", "a dataclass with make(task)"),
-     ("Outer", "a dataclass with make(task)"), ("scled", ":Scaled?"), ("tasks", ":task?"),
+     ("Outer", "a dataclass with make(task)"),
      ("too_few", "must take (task, option=default, ...)"), ("Vague", "'Unknown' is not defined"),
      ("of_any", "must take (task, option=default, ...)"), ("a_number.nope", "attribute 'nope'")],
 )  # fmt: skip

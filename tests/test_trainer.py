@@ -526,7 +526,6 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
 
 @pytest.mark.parametrize("make, field", [
     (lambda agent, task: make_trainer(task.env, agent), "agent"),
-    (lambda agent, task: make_trainer(agent, (task.env, task.params)), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
     (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, paper_training()),
      "task"),

@@ -4,15 +4,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias, TypeVar
 
 import jax
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
-from sejax.envs.environment import Environment, spaces_of
-from sejax.envs.spec import Discrete
+from sejax.envs.spec import Space
 from sejax.options import Options, counts, option, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
@@ -49,31 +48,9 @@ class ActFn(Protocol):
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
 
 
-class Spaces(NamedTuple):
-    """The observations and actions that an agent is made for.
-
-    Attributes:
-      num_states: number of states, if an observation is an index; else None.
-      obs_dim: length of an observation as networks see it.
-      num_actions: number of discrete actions; None for continuous ones.
-      action_dim: length of an action as networks see it.
-    """
-
-    num_states: int | None
-    obs_dim: int
-    num_actions: int | None
-    action_dim: int
-
-    @classmethod
-    def of_env(cls, env: Environment) -> "Spaces":
-        """Those of an environment, or of a proxy."""
-        observation, action = spaces_of(env)
-        return cls(
-            num_states=observation.n if isinstance(observation, Discrete) else None,
-            obs_dim=observation.size,
-            num_actions=action.n if isinstance(action, Discrete) else None,
-            action_dim=action.size,
-        )
+def sizes_of(observation: Space, action: Space) -> tuple[tuple[str, int], ...]:
+    """Kind and size of the observations and of the actions that an agent is made for."""
+    return tuple((type(space).__name__, space.size) for space in (observation, action))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +63,7 @@ class AgentSpec:
       action_repeat: environment steps for each decision.
       cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
         busy alone, a table does not.
-      spaces: observations and actions that it is made for, set by `sejax.make_agent`; None if
+      sizes: `sizes_of` the spaces that it is made for, set by `sejax.make_agent`; None if
         unknown.
     """
 
@@ -94,7 +71,7 @@ class AgentSpec:
     learns_from: int = 0
     action_repeat: int = 1
     cpu_num_parallel: int | None = 1
-    spaces: Spaces | None = None
+    sizes: tuple[tuple[str, int], ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,12 +106,6 @@ class Agent:
     discount: Callable[[Hparams], Array | float | None] = lambda hparams: None
     batch_size: Callable[[AgentState], Array | None] = lambda state: None
     varied: "Varied | None" = None
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError(
-            "An agent holds functions and cannot be pickled. Send its configuration to the other "
-            "process, and call sejax.make_agent there."
-        )
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.

@@ -26,7 +26,6 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 import contextlib
 import dataclasses
 import inspect
-import numbers
 import os
 import re
 import sysconfig
@@ -263,11 +262,9 @@ def as_python(value: Any) -> Any:
     if getattr(value, "shape", None) != () or not hasattr(value, "item"):
         return value
     try:
-        number = value.item()
+        return value.item()
     except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
         return value
-    is_python = type(number) in (bool, int, float) or not isinstance(number, numbers.Real)
-    return number if is_python else float(number)  # such as a long double
 
 
 # --- rules ---------------------------------------------------------------------------------------

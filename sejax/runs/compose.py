@@ -58,11 +58,11 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
     message = f'must be a list of text; got {got}. Set overrides=["env=cartpole"].'
     require(is_list, "overrides", message)
     texts = {}
-    for i, override in enumerate(overrides):
+    for override in overrides:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             got, field = shortened(override), "an override"
-            message = f"{field} must read FIELD=VALUE; got {got}. Write {meant(overrides[i:])}."
+            message = f"{field} must read FIELD=VALUE; got {got}. Write env=cartpole, for example."
             raise ConfigError(message, field)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
@@ -72,18 +72,6 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         require(not (others or is_open), name, message)
         texts[name] = text
     return texts
-
-
-def meant(overrides: Sequence[str]) -> str:
-    """What may be meant by words of which the first is no FIELD=VALUE."""
-    name, *values = [*filter(None, (word.strip("-=") for word in overrides[:3])), *["VALUE"] * 2]
-    if "=" in name:  # after dashes
-        return shortened(name)
-    value = "VALUE" if "=" in values[0] else values[0]
-    is_field = overrides[0].startswith("-") or name in registry.GROUPS or value != "VALUE"
-    if is_field and NAME.fullmatch(name) and not registry.is_registered("env", name):
-        return f"{shortened(name)}={shortened(value)}"
-    return f"env={shortened(name)} or proxy={shortened(name)}, if that is meant"
 
 
 def read(overrides: Sequence[str]) -> dict[str, Any]:
