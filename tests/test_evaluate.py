@@ -153,9 +153,10 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     # Learned with 4000 steps, of which DDQN waits 2 * 200; others wait 10 episodes.
     waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned"))
+    as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
-    assert as_learned.worlds["the proxy"].trainings["ppo"].max_steps == 4000
+    setup = proxy_setup(as_learned)
+    assert setup.worlds["the proxy"].trainings["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
@@ -212,7 +213,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     setup, learner = proxy_setup(config), learned(*words)[0]
-    assert (setup.agents, setup.exploration) == (learner.agents, learner.exploration)
+    assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
     assert setup.worlds["the proxy"].trainings == {"q_learning": config.real_training}
 

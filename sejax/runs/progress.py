@@ -89,7 +89,7 @@ class RunProgress(Progress, Reporter):
             "Train fresh agents on it, and on the real task beside them:\n"
             f"  python -m sejax.evaluate proxy={path}{self._plugin_words()} num_agents=20\n"
             "Use it as a gymnax environment:\n"
-            f'  env, params = sejax.load("{path}")'
+            f'  env, params = sejax.load("{path}"{self._plugin_arguments()})'
         )
 
     def _plugin_words(self) -> str:
@@ -102,3 +102,10 @@ class RunProgress(Progress, Reporter):
             "agents" if len(names) > 1 else "agent": agents,
         }
         return "".join(f" {name}={text}" for name, text in words.items() if ":" in text)
+
+    def _plugin_arguments(self) -> str:
+        """The arguments of `sejax.load` for plugins, as no name in a file is imported."""
+        env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
+        fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
+        task = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
+        return task + (f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else "")
