@@ -123,11 +123,6 @@ class Mixture:
         """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
         return -(-num_incumbent_evals // self.size) * self.size
 
-    def aggregated(self, means: Float[Array, " agent"]) -> Float[Array, ""]:
-        """The incumbent's score, given its mean with each agent; nan if one is."""
-        aggregate = jnp.mean if self.config.aggregate == "mean" else jnp.min
-        return aggregate(means)
-
     def comparable(
         self,
         scores: Float[Array, " pop"],

@@ -1,8 +1,8 @@
 """PPO with a clipped ratio, for discrete and for continuous actions.
 
-There are two ways to prepare a rollout (`ADVANTAGES`): `gae`, the usual generalised advantages, and
-`monte_carlo`, the returns of the paper's code, which learns from the whole rollout in each Adam
-step (`PPOConfig.paper`). All else is the same.
+There are two ways to prepare a rollout (`PPOConfig.advantages`): `gae`, the usual generalised
+advantages, and `monte_carlo`, the returns of the paper's code, which learns from the whole rollout
+in each Adam step (`PPOConfig.paper`). All else is the same.
 
 Without exploration the agent takes its most probable action. Differs: the authors also test with
 sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
@@ -49,7 +49,6 @@ Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
 Moved = tuple[Array, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
-ADVANTAGES = ("monte_carlo", "gae")
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
@@ -81,7 +80,7 @@ class PPOConfig(AgentOptions):
     update_episodes: int = option(10, counts())
     epochs: int = option(10, counts())
     num_minibatches: int = option(4, counts())
-    advantages: str = option("gae", one_of(ADVANTAGES))
+    advantages: str = option("gae", one_of(("monte_carlo", "gae")))
     gae_lambda: float = option(0.9, fraction(), traced=True)
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)

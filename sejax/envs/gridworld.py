@@ -153,5 +153,4 @@ class GridWorld2x2:
     )
 
     def make(self) -> Task:
-        params = GridParams(step_reward=-0.01, goal_reward=1.0, hole_reward=-1.0)
-        return Task.of(self.spec, name="gridworld_2x2", env=GridWorld(ROOM_2X2, params))
+        return Task.of(self.spec, name="gridworld_2x2", env=GridWorld(ROOM_2X2))

@@ -46,8 +46,6 @@ from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, r
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
-EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
-TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
@@ -238,8 +236,8 @@ class EvaluateConfig(CommandConfig):
     proxy: str
     env: str | None = option(None, names_code=True)
     proxy_kind: str | None = option(None, names_code=True)
-    agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
-    training_from: str = option("proxy", one_of(TRAINING_FROM))
+    agent_hparams: str = option("default", one_of((*AGENT_HPARAMS, "as_learned")))
+    training_from: str = option("proxy", one_of(("proxy", "config")))
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
     baseline: bool = True
     out_dir: str | None = None
