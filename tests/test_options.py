@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import refusal, refused
+from support import refusal
 
 import sejax
 from sejax import options
@@ -75,12 +75,6 @@ def test_two_whole_messages():
 ])  # fmt: skip
 def test_a_value_at_the_edge_of_its_rule_is_taken(name, value):
     assert getattr(Config(**{name: value}), name) == value or value != value
-
-
-def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
-    foreign = dataclasses.make_dataclass("Foreign", [("size", int, option(4, options.counts()))])
-    assert refused(options.check, foreign(size=0), "mine") == "mine.size"  # it checks not itself
-    options.check(foreign(), "mine")
 
 
 def test_options_are_frozen_and_given_by_keyword():
