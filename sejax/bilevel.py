@@ -167,7 +167,6 @@ def make_learner(
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
     Jitted it is one executable with the scan inside. `vmap` it over keys for several runs at once.
-    It cannot be pickled: send the configuration to another process, and build it there.
 
     Args:
       config: from `sejax.config`, in the place of all others. Its `seed`, `run_dir` and

@@ -25,7 +25,6 @@ from sejax.ops.files import require_writable, write_text
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
-from sejax.runs.progress import Tally
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
 
 
@@ -69,14 +68,14 @@ def evaluate(config: EvaluateConfig) -> float:
     tables = {
         (world, key): _train_and_test(config, setup, world, key)
         for world in setup.worlds
-        for key in setup.agents
+        for key in config.agents
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
-    summary = summarise(table, ["world", "agent"] if len(setup.agents) > 1 else ["world"])
+    summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
     _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    title = f"fresh {' + '.join(setup.agents)} agents on {setup.task.name}"
+    title = f"fresh {' + '.join(config.agents)} agents on {setup.task.name}"
     plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png", title)
     first = table[table["world"] == next(iter(setup.worlds))]
     return float(first["test_return"].mean())
@@ -86,18 +85,17 @@ def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) 
     """A row for each agent of a kind."""
     env, env_params, trainings = setup.worlds[world]
     is_varied = config.agent_hparams == "varied"
-    agent = make_agent(setup.agents[key], setup.task, setup.exploration, is_varied)
+    agent = make_agent(config.agents[key], setup.task, config.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    who = f"{key} agents" if len(setup.agents) > 1 else "agents"
+    who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
-    with Tally(config.num_agents, f"{who} on {world}") as tally:
-        training, add = trainings[key], tally.add if tally.is_live else None
-        limits = config.num_parallel, config.devices
-        outcome = evaluate_agents(agent, env, env_params, setup.task, training, keys, *limits, add)
-        outcome = jax.device_get(outcome)
+    print(f"training {config.num_agents:,} {who} on {world} ...", flush=True)
+    limits = config.num_parallel, config.devices
+    outcome = evaluate_agents(agent, env, env_params, setup.task, trainings[key], keys, *limits)
+    outcome = jax.device_get(outcome)
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
-    if len(setup.agents) > 1:
+    if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
     of_agents = {  # not of episodes, and no agreement of ranks
         name: x for name, x in vars(outcome).items() if x is not None and x.ndim == 1
@@ -134,7 +132,7 @@ def spread(mean: float, std: float, digits: int) -> str:
 
 def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
-    (first, *others) = setup.agents
+    (first, *others) = config.agents
     who = "agents of each kind" if others else f"{first} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")

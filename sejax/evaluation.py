@@ -332,7 +332,6 @@ def evaluate_agents(
     keys: Array,
     num_parallel: int | None = None,
     devices: int | None = None,
-    on_done: Callable[[], None] | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
@@ -340,13 +339,9 @@ def evaluate_agents(
     arguments; `env_params` may differ, and `keys` in their values. The numbers are those of
     `jax.vmap(make_evaluator(...))` up to rounding: a program of another width adds in another
     order, and in a training a last bit grows.
-
-    `on_done` is called from the program's threads as each agent ends, also for copies that fill up
-    the last batch. The numbers are the same with it, but it compiles for each such function, and
-    jax keeps no program on disk that calls back.
     """
     env = env.bare if isinstance(env, ProxyEnv) else env
-    program = _evaluation_program(agent, env, task, training, num_parallel, devices, on_done)
+    program = _evaluation_program(agent, env, task, training, num_parallel, devices)
     return program(keys, env_params)
 
 
@@ -358,17 +353,13 @@ def _evaluation_program(
     training: TrainingConfig,
     num_parallel: int | None,
     devices: int | None,
-    on_done: Callable[[], None] | None,
 ) -> Callable[[Array, PyTree], Outcome]:
     """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
     evaluate = make_evaluator(agent, env, task, training)
 
     def program(keys: Array, env_params: PyTree) -> Outcome:
         def one(key: Array) -> Outcome:
-            outcome: Outcome = evaluate(key, env_params)
-            if on_done is not None:
-                jax.debug.callback(lambda _: on_done(), outcome.test_return)
-            return outcome
+            return evaluate(key, env_params)
 
         width = num_parallel_on_cpu(agent, training)
         if width is not None:

@@ -169,11 +169,12 @@ class Scoring:
             incumbent = incumbent.at[of_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
+        aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
             incumbent=incumbent,
             agent_means=agent_means,
-            incumbent_mean=self.mixture.aggregated(agent_means),
+            incumbent_mean=aggregate(agent_means),
             diverged=~jnp.isfinite(scores),
         )
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentState, Hparams, Spaces
+from sejax.agents.base import Agent, AgentState, Hparams, sizes_of
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
-from sejax.envs.environment import Environment
+from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
@@ -36,7 +36,7 @@ from sejax.options.parts import require_part
 from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
-SOLVED_BY = ("test", "train")
+
 
 # Modes of jax in which programs of sejax fail: values that they may have, and why no others.
 MODES: dict[str, tuple[tuple[object, ...], str]] = {
@@ -78,7 +78,7 @@ class TrainingConfig(Options):
     stop_rule: str = option("never", one_of(STOP_RULES))
     window: int = option(10, counts("it counts episodes"))
     plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
-    solved_by: str = option("test", one_of(SOLVED_BY))
+    solved_by: str = option("test", one_of(("test", "train")))
     test_episodes: int = option(10, counts("it counts episodes"))
     tests_between: int = option(0, counts("it counts episodes", least=0))
     time_limit_is_terminal: bool = True
@@ -235,15 +235,12 @@ def make_trainer(
       (8, 20)
     """
     require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
-    fix = "Set env to the first of the pair that sejax.load returns, or to task.env."
-    must = f"must be a gymnax environment; got {type(env).__name__}. {fix}"
-    require(hasattr(env, "step_env"), "env", must)
     require_own_steps(env)
-    spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
+    sizes = sizes_of(*spaces_of(env))
     require(
-        agent.spec.spaces == spaces,
+        agent.spec.sizes in (None, sizes),
         "agent",
-        f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
+        f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}. "
         "Set agent=sejax.make_agent(config, task) with that task.",
     )
     require_part("training", TrainingConfig, training)

@@ -27,9 +27,8 @@ CONFIG = DDQNConfig(
 )  # fmt: skip
 EXACT = [activation for activation in ACTIVATIONS if activation != "fast_tanh"]
 CASES = {activation: replace(CONFIG, activation=activation) for activation in EXACT} | {
-    "dqn": replace(CONFIG, double=False, loss="huber", target_update_every=2,
-                   tau=1.0),
-}  # fmt: skip
+    "dqn": replace(CONFIG, double=False),
+}
 DUELING = DuelingDDQNConfig(
     hidden_size=5, num_layers=2, feature_dim=4, stream_hidden_size=6, stream_num_layers=1,
     activation="tanh", batch_size=BATCH, learning_rate=0.01, tau=0.1, discount=0.9,

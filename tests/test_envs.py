@@ -292,9 +292,3 @@ def test_the_move_into_the_goal_can_be_paid():
     _, reward, _ = step_everywhere(task.env, task.params)
     assert reward[35, DOWN] == reward[24, RIGHT] == -1.0
     assert refused(envs.make, "cliff_walking", goal_reward=float("nan")) == "env.goal_reward"
-
-
-@pytest.mark.parametrize("rows", [("S ", "G"), ("SX", " G"), ("SG", "S "), ("  ", " G")])
-def test_a_map_that_is_no_grid_world_is_refused(rows):
-    with pytest.raises(ValueError, match="rows must"):
-        GridWorld(rows)

@@ -12,7 +12,7 @@ from support import paper_se, refused
 
 import sejax
 from sejax import envs
-from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
+from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
@@ -79,7 +79,6 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
         (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
         (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
         (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
-        (lambda: MixtureConfig(compared_by="x"), "agents.compared_by"),
     ],
 )
 def test_a_mixture_that_cannot_be_is_refused(make, field):
@@ -92,7 +91,7 @@ SCORES = np.array([200, -500, 150, NAN, 190, -80, NAN, -500, 10, -90, 180, -100]
 AGENT = np.array([0, 1] * 6)
 
 
-def plain_comparable(scores, agent, incumbents, compared_by):
+def plain_comparable(scores, agent, incumbents):
     """The same in plain Python, one candidate at a time."""
     out = []
     for score, own_index in zip(scores, agent, strict=True):
@@ -101,40 +100,32 @@ def plain_comparable(scores, agent, incumbents, compared_by):
         incumbent = incumbents[own_index]
         if not np.isfinite(incumbent):
             incumbent = sum(alive) / len(alive) if alive else NAN
-
-        def share_below(x, own=own):
-            return sum(1.0 if s < x else 0.5 if s == x else 0.0 for s in own) / len(own)
-
         if not np.isfinite(score):
             out.append(NAN)
-        elif compared_by == "advantage":
-            out.append(float(score) - incumbent)
         else:
-            out.append(share_below(float(score)) - share_below(incumbent))
+            out.append(float(score) - incumbent)
     return out
 
 
-def compare(scores, agent, incumbents, by):
+def compare(scores, agent, incumbents):
     """`comparable` of as many agents as there are incumbents' means, in NumPy."""
-    comparable = mixture(len(incumbents), compared_by=by).comparable
+    comparable = mixture(len(incumbents)).comparable
     candidates = [np.flatnonzero(np.array(agent) == i) for i in range(len(incumbents))]
     jitted = jax.jit(lambda scores, means: comparable(scores, candidates, means))
     return jax.device_get(jitted(np.float32(scores), np.float32(incumbents)))
 
 
-@pytest.mark.parametrize("by", COMPARED_BY)
 @pytest.mark.parametrize("incumbents", [(160.0, -95.0), (190.0, NAN), (NAN, NAN)])
-def test_scores_are_compared_within_their_agent(by, incumbents):
-    got, incumbent = compare(SCORES, AGENT, incumbents, by)
-    expected = plain_comparable(SCORES, AGENT, incumbents, by)
+def test_scores_are_compared_within_their_agent(incumbents):
+    got, incumbent = compare(SCORES, AGENT, incumbents)
+    expected = plain_comparable(SCORES, AGENT, incumbents)
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
     assert incumbent == 0.0
 
 
-@pytest.mark.parametrize("by", COMPARED_BY)
-def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing(by):
+def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing():
     mean = np.float32(-93.3) - np.float32(2e-5)  # as a mean of equal scores may be off
-    got, _ = compare([-93.3, 0.0, -93.3, 1.0], [0, 1, 0, 1], [mean, 0.5], by)
+    got, _ = compare([-93.3, 0.0, -93.3, 1.0], [0, 1, 0, 1], [mean, 0.5])
     assert got[0] == got[2] == 0 and got[1] < 0 < got[3]
 
 
@@ -276,8 +267,7 @@ def program_text(bilevel):
 
 def test_a_mixture_of_one_agent_is_the_program_of_that_agent():
     alone = program_text(bilevel_of(AGENTS[0]))
-    config = MixtureConfig(compared_by="rank")
-    one = Mixture(agents=AGENTS[:1], names=("q",), weights=(3.0,), config=config)
+    one = Mixture(agents=AGENTS[:1], names=("q",), weights=(3.0,))
     assert program_text(bilevel_of(one)) == alone
     assert program_text(bilevel_of(AGENTS[1])) != alone
 

@@ -196,7 +196,7 @@ def evosax_strategy(name, **fields):
 def test_the_names_are_those_of_evosaxs_classes_and_of_the_registry():
     from evosax.algorithms import distribution_based_algorithms
 
-    classes = {algorithm.cls for algorithm in ALGORITHMS.values()}
+    classes = {cls for cls, *_ in ALGORITHMS.values()}
     assert classes <= set(distribution_based_algorithms)
     assert registry.names("es") == ["nes", *ALGORITHMS]
 

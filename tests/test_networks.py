@@ -6,13 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import linen as nn
 from support import assert_close, numpy_forward, random_like, shapes_of
 
 from sejax.ops.networks import (
     MLP,
     PRELU_SLOPE,
-    OnImages,
     affine,
     fast_tanh,
     tanh,
@@ -107,23 +105,3 @@ def test_affine_and_its_gradient_equal_the_plain_product(num_inputs, num_outputs
         return jax.jit(total)(*args)
 
     assert_close(values_of(affine), values_of(plain), rtol=1e-4, atol=1e-5)
-
-
-def test_filters_of_images_equal_flax_convolution():
-    image, inner = (5, 6, 2), MLP(3, 4, 1, "relu")
-    net = OnImages(image, 7, inner)
-    params = random_like(shapes_of(net.init, jax.random.key(0), np.zeros(60))["params"])
-    x = np.random.default_rng(0).normal(size=(60, 5)).astype(np.float32)
-
-    filters = params["filters"]
-    kernel = filters["kernel"].reshape(7, 3, 3, 2).transpose(1, 2, 3, 0)
-    conv = nn.Conv(7, (3, 3), padding="VALID")
-    filtered = conv.apply({"params": {"kernel": kernel, "bias": filters["bias"]}},
-                          x.T.reshape(5, *image))  # fmt: skip
-    seen = np.maximum(filtered, 0).transpose(3, 1, 2, 0).reshape(-1, 5)  # [filter row column, 5]
-    expected = inner.apply({"params": params["network"]}, seen)
-
-    np.testing.assert_allclose(net.apply({"params": params}, x), expected, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(
-        net.apply({"params": params}, x[:, 2]), expected[:, 2], rtol=1e-4, atol=1e-5
-    )

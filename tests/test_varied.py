@@ -144,9 +144,7 @@ def test_narrowed_weights_are_distributed_as_those_of_a_small_network():
 
 
 def test_a_layer_norm_sees_only_the_units_in_use():
-    small, large = (
-        MLP(2, size, 3, "tanh", layer_norm=True, may_narrow=True) for size in (SMALL, LARGE)
-    )
+    small, large = (MLP(2, size, 3, "tanh", layer_norm=True) for size in (SMALL, LARGE))
     x = np.float32(np.random.default_rng(0).normal(size=(OBS_DIM, 6)))
 
     @jax.jit

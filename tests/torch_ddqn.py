@@ -16,7 +16,6 @@ class TorchDDQN:
         self.config = config
         self.online, self.target = self.network(params), self.network(target_params)
         self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
-        self.num_updates = 0
 
     def network(self, params):
         return TorchMLP(params, self.config.activation)
@@ -33,15 +32,11 @@ class TorchDDQN:
             else:
                 value = values.max(1).values
             goal = batch.reward + self.config.discount * batch.discount * value
-        kinds = {"squared": torch.nn.functional.mse_loss,
-                 "huber": torch.nn.functional.smooth_l1_loss}  # fmt: skip
-        loss = kinds[self.config.loss](q, goal)
+        loss = torch.nn.functional.mse_loss(q, goal)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-        self.num_updates += 1
-        if self.num_updates % self.config.target_update_every == 0:
-            follow(self.target, self.online, self.config.tau)
+        follow(self.target, self.online, self.config.tau)
 
     def flat(self):
         """Parameters as the agent keeps them."""

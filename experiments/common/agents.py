@@ -23,7 +23,6 @@ from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
 from sejax.options.plain import to_plain
-from sejax.runs.progress import Tally
 
 # Kinds of students, where actions are discrete and where they are continuous.
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -134,23 +133,22 @@ def train_groups(
     names = list(groups)
     at_once = 1 if measure.is_timed else min(len(groups), groups_at_once(settings.devices))
     tables = []
-    with Tally(len(groups) * num_agents, f"agents: {condition.name}") as tally:
-        for first in range(0, len(groups), at_once):
-            chosen = names[first : first + at_once]
-            made_with = {
-                name: shared | {"group": groups[name].name, "weights": groups[name].fingerprint}
-                for name in chosen
-            }
+    print(f"training {len(groups) * num_agents:,} agents: {condition.name} ...", flush=True)
+    for first in range(0, len(groups), at_once):
+        chosen = names[first : first + at_once]
+        made_with = {
+            name: shared | {"group": groups[name].name, "weights": groups[name].fingerprint}
+            for name in chosen
+        }
 
-            def compute(missing: list[str]) -> list[pd.DataFrame]:
-                places = [names.index(name) for name in missing]
-                return train(condition, settings, num_agents, measure, places, at_once)
+        def compute(missing: list[str]) -> list[pd.DataFrame]:
+            places = [names.index(name) for name in missing]
+            return train(condition, settings, num_agents, measure, places, at_once)
 
-            made = settings.shards.compute_all(made_with, compute)
-            for name, table in zip(chosen, made, strict=True):
-                print(f"{name}: done", flush=True)
-                tables.append(table.assign(group=groups[name].name))
-                tally.add(num_agents)
+        made = settings.shards.compute_all(made_with, compute)
+        for name, table in zip(chosen, made, strict=True):
+            print(f"{name}: done", flush=True)
+            tables.append(table.assign(group=groups[name].name))
     return worst_for_diverged(pd.concat(tables, ignore_index=True), condition.name)
 
 

@@ -23,7 +23,6 @@ from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
 from sejax.runs import config as configuration
 from sejax.runs import run_directory, session, workers
-from sejax.runs.progress import Tally
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
 QUICK = (
@@ -91,23 +90,21 @@ def learn(
     """
     chunks = chunks or workers.make_chunks(configs[0])
     curves = []
-    with Tally(len(configs), "NES runs") as tally:
-        for config in configs:
-            with run_directory.RunDirectory(config, f"Set {option}=DIR.") as directory:
-                path = directory.path / "cpu_s.txt"
-                session.run(config, directory, timed(chunks, path))
-                curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
-            there = int(curve["generation"].max()) + 1 if len(curve) else 0
-            require(
-                there <= config.generations,
-                "generations",
-                f"must be at least {there}, as the run in {config.run_dir} has so many; got "
-                f"{config.generations}. Set generations={there}, or another folder.",
-            )
-            best = curve["best_so_far"].max()
-            print(f"{config.run_dir}: {there} generations, best {best:.1f}", flush=True)
-            curves.append(curve.assign(cpu_s=pd.Series(read_costs(path, len(curve)))))
-            tally.add()
+    for config in configs:
+        with run_directory.RunDirectory(config, f"Set {option}=DIR.") as directory:
+            path = directory.path / "cpu_s.txt"
+            session.run(config, directory, timed(chunks, path))
+            curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
+        there = int(curve["generation"].max()) + 1 if len(curve) else 0
+        require(
+            there <= config.generations,
+            "generations",
+            f"must be at least {there}, as the run in {config.run_dir} has so many; got "
+            f"{config.generations}. Set generations={there}, or another folder.",
+        )
+        best = curve["best_so_far"].max()
+        print(f"{config.run_dir}: {there} generations, best {best:.1f}", flush=True)
+        curves.append(curve.assign(cpu_s=pd.Series(read_costs(path, len(curve)))))
     return pd.concat(curves, ignore_index=True)
 
 

@@ -14,7 +14,7 @@ from sejax.agents.base import AgentSpec as AgentSpec
 from sejax.agents.base import ExplorationConfig as ExplorationConfig
 from sejax.agents.base import Hparams as Hparams
 from sejax.agents.base import NoExploration as NoExploration
-from sejax.agents.base import Spaces
+from sejax.agents.base import sizes_of
 from sejax.agents.base import traced as traced
 from sejax.agents.buffers import Buffer as Buffer
 from sejax.agents.buffers import Rollout as Rollout
@@ -74,9 +74,9 @@ def _make_agent(
     def make(config: AgentConfig) -> Agent:
         agent = registry.make("agent", config, task)
         agent = registry.make("exploration", exploration, agent, task)
-        return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, spaces=spaces))
+        return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, sizes=sizes))
 
-    spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
+    sizes = sizes_of(task.observation, task.action)
     return make_varied(config, make) if varied else make(config)
 
 

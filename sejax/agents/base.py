@@ -4,18 +4,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import jax
-from flax import linen as nn
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
-from sejax.envs.environment import Environment, spaces_of
-from sejax.envs.spec import Discrete
-from sejax.ops.networks import OnImages
-from sejax.options import Options, counts, one_of, option, require, traced_options
+from sejax.envs.spec import Space
+from sejax.options import Options, counts, option, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -51,31 +48,9 @@ class ActFn(Protocol):
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
 
 
-class Spaces(NamedTuple):
-    """The observations and actions that an agent is made for.
-
-    Attributes:
-      num_states: number of states, if an observation is an index; else None.
-      obs_dim: length of an observation as networks see it.
-      num_actions: number of discrete actions; None for continuous ones.
-      action_dim: length of an action as networks see it.
-    """
-
-    num_states: int | None
-    obs_dim: int
-    num_actions: int | None
-    action_dim: int
-
-    @classmethod
-    def of_env(cls, env: Environment) -> "Spaces":
-        """Those of an environment, or of a proxy."""
-        observation, action = spaces_of(env)
-        return cls(
-            num_states=observation.n if isinstance(observation, Discrete) else None,
-            obs_dim=observation.size,
-            num_actions=action.n if isinstance(action, Discrete) else None,
-            action_dim=action.size,
-        )
+def sizes_of(observation: Space, action: Space) -> tuple[tuple[str, int], ...]:
+    """Kind and size of the observations and of the actions that an agent is made for."""
+    return tuple((type(space).__name__, space.size) for space in (observation, action))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +63,7 @@ class AgentSpec:
       action_repeat: environment steps for each decision.
       cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
         busy alone, a table does not.
-      spaces: observations and actions that it is made for, set by `sejax.make_agent`; None if
+      sizes: `sizes_of` the spaces that it is made for, set by `sejax.make_agent`; None if
         unknown.
     """
 
@@ -96,7 +71,7 @@ class AgentSpec:
     learns_from: int = 0
     action_repeat: int = 1
     cpu_num_parallel: int | None = 1
-    spaces: Spaces | None = None
+    sizes: tuple[tuple[str, int], ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -232,6 +207,7 @@ class AgentOptions(AgentConfig):
 
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
+    removed: ClassVar[dict[str, Any]] = {"torso": None, "num_filters": 16}
 
     warmup_episodes: int = option(1, counts("it counts episodes", least=0))
 
@@ -241,47 +217,6 @@ class AgentOptions(AgentConfig):
     def spec(self) -> AgentSpec:
         """The spec of an agent that learns once it has warmed up."""
         return AgentSpec(warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorsoOptions(AgentOptions):
-    """What agents share that can see images.
-
-    Attributes:
-      torso: what comes before the hidden layers
-      num_filters: of torso=conv, each of 3 x 3 pixels
-    """
-
-    torso: str | None = option(None, one_of(("conv",)))
-    num_filters: int = option(16, counts())
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.torso is not None or self.num_filters == type(self).num_filters,
-            "agent.num_filters",
-            f"must be left out without a torso; got {self.num_filters}. Set agent.torso=conv.",
-        )
-
-    def with_torso(self, network: nn.Module, image: tuple[int, ...]) -> nn.Module:
-        """The network behind the torso.
-
-        Args:
-          network: of the hidden layers and the outputs.
-          image: rows, columns and channels of the observations; empty if they are no images.
-
-        Raises:
-          ConfigError: for a torso for images where there are none.
-        """
-        if self.torso is None:
-            return network
-        require(
-            len(image) == 3 and min(image[:2]) >= 3,
-            "agent.torso",
-            "must be null unless observations are images of rows, columns and channels, at least 3 "
-            f"x 3 pixels; got {self.torso}. Set agent.torso=null.",
-        )
-        return OnImages(image, self.num_filters, network)
 
 
 @dataclass(frozen=True, kw_only=True)

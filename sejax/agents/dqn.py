@@ -16,7 +16,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, TorsoOptions
+from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import (
     FlatNetwork,
@@ -29,13 +29,11 @@ from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
 from sejax.ops import cpu, flat
 from sejax.ops.networks import DuelingMLP
-from sejax.options import MOST_LAYERS, counts, fraction, one_of, option
-
-LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
+from sejax.options import MOST_LAYERS, counts, fraction, option
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDQNConfig(OffPolicyOptions, TorsoOptions):
+class DDQNConfig(OffPolicyOptions):
     """DDQN's hyperparameters.
 
     Attributes:
@@ -44,25 +42,25 @@ class DDQNConfig(OffPolicyOptions, TorsoOptions):
       exploration_steps: If given, epsilon falls linearly in so many steps from when the agent first
         learns, whatever the episodes: for environments whose episodes have one or two steps.
       double: the online network chooses a target's action; else the target network
-      loss: of the error; huber: its gradient is clipped
-      target_update_every: learning steps for each update of the target
     """
 
-    removed: ClassVar[tuple[tuple[str, Any], ...]] = (("train_every", 1), ("gradient_steps", 1))
+    removed: ClassVar[dict[str, Any]] = {
+        **OffPolicyOptions.removed,
+        **dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1),
+        "loss": "squared",
+    }
 
     epsilon_init: float = option(1.0, fraction(), traced=True)
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)
     exploration_steps: int | None = option(1000, counts("it counts steps"), traced=True)
     double: bool = True
-    loss: str = option("squared", one_of(LOSSES))
-    target_update_every: int = option(1, counts())
 
     @property
     def cpu_num_parallel(self) -> int:
         """The fastest `vmap` width on one CPU core."""
         product = self.hidden_size * self.batch_size
-        is_small = self.torso is None and self.num_layers == 1 and product <= cpu.SMALL_PRODUCT
+        is_small = self.num_layers == 1 and product <= cpu.SMALL_PRODUCT
         return cpu.SMALL_NUM_PARALLEL if is_small else 1
 
     def spec(self) -> AgentSpec:
@@ -71,7 +69,7 @@ class DDQNConfig(OffPolicyOptions, TorsoOptions):
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
         assert task.num_actions is not None
-        return DDQN(self, task.obs_dim, task.num_actions, task.image).agent()
+        return DDQN(self, task.obs_dim, task.num_actions).agent()
 
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
@@ -127,8 +125,7 @@ class DDQNState(struct.PyTreeNode):
 class DDQN(OffPolicy):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    A `DuelingDDQNConfig` makes its network a dueling one. `image` are rows, columns and channels of
-    observations that are images, for a config with a torso.
+    A `DuelingDDQNConfig` makes its network a dueling one.
 
     Example:
       >>> agent = DDQN(DDQNConfig(), obs_dim=4, num_actions=2).agent()
@@ -139,12 +136,9 @@ class DDQN(OffPolicy):
 
     config: DDQNConfig
 
-    def __init__(
-        self, config: DDQNConfig, obs_dim: int, num_actions: int, image: tuple[int, ...] = ()
-    ):
+    def __init__(self, config: DDQNConfig, obs_dim: int, num_actions: int):
         self.config = config
-        network = config.with_torso(config.network(num_actions), image)
-        self.network = FlatNetwork(network, obs_dim)
+        self.network = FlatNetwork(config.network(num_actions), obs_dim)
 
     def init(self, key: Array, hparams: Hparams) -> DDQNState:
         params = self.network.init(key, hparams.hidden_size)
@@ -185,17 +179,14 @@ class DDQN(OffPolicy):
             discount = hp.discount * batch.discount
             targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
             predicted = select_action(q_values(params, batch.obs), batch.action)
-            losses = LOSSES[config.loss](predicted - jax.lax.stop_gradient(targets))
-            return jnp.sum(batch.weight * losses)
+            return jnp.sum(batch.weight * (predicted - jax.lax.stop_gradient(targets)) ** 2)
 
         params, opt_state = adam_step(sum_of_losses, state.params, state.opt_state, (batch,), hp)
-        tau, num_steps = hp.tau, state.num_steps + 1
-        if config.target_update_every > 1:
-            tau = jnp.where(opt_state.count % config.target_update_every == 0, tau, 0.0)
+        num_steps = state.num_steps + 1
         steps_decide = hp.exploration_steps is not None
         return state.replace(
             params=params,
-            target_params=soft_update(state.target_params, params, tau),
+            target_params=soft_update(state.target_params, params, hp.tau),
             opt_state=opt_state,
             num_steps=num_steps,
             epsilon=linear_epsilon(hp, num_steps) if steps_decide else state.epsilon,

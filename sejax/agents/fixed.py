@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, Spaces
+from sejax.agents.base import Agent, AgentSpec, Hparams, sizes_of
 from sejax.agents.buffers import no_buffer
 from sejax.envs.base import Task
 
@@ -31,5 +31,5 @@ def make_fixed(task: Task, act: Callable[[Array, Any, Array], Array]) -> Agent:
         update=lambda key, state, batch: state,
         buffer=no_buffer(),
         hparams=Hparams(),
-        spec=AgentSpec(spaces=Spaces.of_env(task.env)),
+        spec=AgentSpec(sizes=sizes_of(task.observation, task.action)),
     )

@@ -7,9 +7,8 @@ outer loop helps all of them, at the same number of trainings.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,8 +18,6 @@ from sejax.ops.scores import finite_mean, is_tie
 from sejax.options import Options, one_of, option, require, shortened
 from sejax.options.parts import require_part
 
-COMPARED_BY = ("advantage", "rank")
-
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureConfig(Options):
@@ -29,15 +26,12 @@ class MixtureConfig(Options):
     Attributes:
       aggregate: The incumbent's score, given its mean with each agent: the mean of those, or the
         worst.
-      compared_by: How scores of several agents become comparable. advantage: a candidate's score
-        less the incumbent's mean with the same agent; rank: its rank among that agent's candidates,
-        less the incumbent's.
     """
 
     group: ClassVar[str] = "agents"
+    removed: ClassVar[dict[str, Any]] = {"compared_by": "advantage"}
 
     aggregate: str = option("mean", one_of(("mean", "min")))
-    compared_by: str = option("advantage", one_of(COMPARED_BY))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,18 +67,13 @@ class Mixture:
         size = len(self.agents)
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
+        is_weighted = min(self.weights, default=0) >= 0 and max(self.weights, default=0) > 0
         require(
-            size > 0 and len(self.names) == len(self.weights) == size,
+            is_weighted and len(self.names) == len(self.weights) == size,
             "agents",
-            "must hold an agent, and as many names and weights as agents; got "
+            "must have a name and a weight each, one above 0 and none below; got "
             f"{size} agents, names={shortened(self.names)} and weights={shortened(self.weights)}. "
             "Set names=() and weights=().",
-        )
-        require(
-            min(self.weights) >= 0 and max(self.weights) > 0,
-            "agents",
-            "must have a weight above 0, and none below; got "
-            f"{shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
@@ -134,11 +123,6 @@ class Mixture:
         """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
         return -(-num_incumbent_evals // self.size) * self.size
 
-    def aggregated(self, means: Float[Array, " agent"]) -> Float[Array, ""]:
-        """The incumbent's score, given its mean with each agent; nan if one is."""
-        aggregate = jnp.mean if self.config.aggregate == "mean" else jnp.min
-        return aggregate(means)
-
     def comparable(
         self,
         scores: Float[Array, " pop"],
@@ -147,7 +131,8 @@ class Mixture:
     ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of candidates with different agents in one unit, and the incumbent's.
 
-        Those of a single agent stay as they are.
+        They are advantages over the incumbent's mean with the same agent. Those of a single agent
+        stay as they are.
 
         Args:
           scores: of the candidates; not finite where training diverged, and then they stay so.
@@ -157,27 +142,14 @@ class Mixture:
         """
         if self.size == 1:
             return scores, incumbent_means[0]
-        compare = _ranks if self.config.compared_by == "rank" else _advantages
         compared = scores
         for numbers, mean in zip(candidates, incumbent_means, strict=True):
             if numbers.size:
                 of_agent = scores[numbers]
                 mean = jnp.where(jnp.isfinite(mean), mean, finite_mean(of_agent))
-                compared = compared.at[numbers].set(compare(of_agent, mean))
+                compared = compared.at[numbers].set(_advantages(of_agent, mean))
         return compared, jnp.float32(0)
 
 
 def _advantages(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
     return jnp.where(is_tie(scores, incumbent), 0.0, scores - incumbent)
-
-
-def _ranks(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
-    """Shares of the candidates that are worse, less that of the incumbent."""
-
-    def share_below(score: Array, same: Array) -> Array:
-        worse = (scores < score) & ~same  # False where either is not a number
-        return (worse.sum() + 0.5 * same.sum()) / scores.shape[0]
-
-    below = jax.vmap(lambda score: share_below(score, scores == score))(scores)
-    shares = below - share_below(incumbent, is_tie(scores, incumbent))
-    return jnp.where(jnp.isfinite(scores), shares, jnp.nan)

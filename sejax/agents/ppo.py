@@ -1,8 +1,8 @@
 """PPO with a clipped ratio, for discrete and for continuous actions.
 
-There are two ways to prepare a rollout (`ADVANTAGES`): `gae`, the usual generalised advantages, and
-`monte_carlo`, the returns of the paper's code, which learns from the whole rollout in each Adam
-step (`PPOConfig.paper`). All else is the same.
+There are two ways to prepare a rollout (`PPOConfig.advantages`): `gae`, the usual generalised
+advantages, and `monte_carlo`, the returns of the paper's code, which learns from the whole rollout
+in each Adam step (`PPOConfig.paper`). All else is the same.
 
 Without exploration the agent takes its most probable action. Differs: the authors also test with
 sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
@@ -25,7 +25,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Hparams, Learner, TorsoOptions
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
@@ -49,12 +49,11 @@ Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
 Moved = tuple[Array, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
-ADVANTAGES = ("monte_carlo", "gae")
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig(TorsoOptions):
+class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions.
 
     The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
@@ -81,7 +80,7 @@ class PPOConfig(TorsoOptions):
     update_episodes: int = option(10, counts())
     epochs: int = option(10, counts())
     num_minibatches: int = option(4, counts())
-    advantages: str = option("gae", one_of(ADVANTAGES))
+    advantages: str = option("gae", one_of(("monte_carlo", "gae")))
     gae_lambda: float = option(0.9, fraction(), traced=True)
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
@@ -124,9 +123,9 @@ class PPOConfig(TorsoOptions):
         """The agent for a task's observations and actions."""
         length = self.rollout_length(task.max_steps)
         if task.num_actions is not None:
-            return PPO(self, task.obs_dim, task.num_actions, length, task.image).agent()
+            return PPO(self, task.obs_dim, task.num_actions, length).agent()
         sizes = task.obs_dim, task.action_dim, length
-        return ContinuousPPO(self, *sizes, task.image, task.max_action).agent()
+        return ContinuousPPO(self, *sizes, task.max_action).agent()
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -193,7 +192,6 @@ class PPO(Learner):
       obs_dim: length of an observation.
       action_dim: number of actions, or the length of a continuous one: outputs of the actor.
       length: decisions between two learning phases.
-      image: rows, columns and channels of observations that are images, for a torso.
       max_action: the largest continuous action; None for discrete ones.
 
     Raises:
@@ -214,7 +212,6 @@ class PPO(Learner):
         obs_dim: int,
         action_dim: int,
         length: int,
-        image: tuple[int, ...] = (),
         max_action: float | None = None,
     ):
         require(
@@ -227,8 +224,7 @@ class PPO(Learner):
         self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
         shape = (config.hidden_size, config.num_layers, config.activation)
         self.actor, self.critic = (
-            config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)
-            for size in (action_dim, 1)
+            MLP(size, *shape, learn_prelu_slope=True) for size in (action_dim, 1)
         )
         self.optimizer = config.optimizer()
         template = jax.eval_shape(self.init_tree, jax.random.key(0))

@@ -92,7 +92,7 @@ class DiscreteTD3Config(TD3Config):
         return DiscreteTD3(self, task.obs_dim, task.num_actions, 1.0).agent()
 
     def mlp(self, num_outputs: int) -> MLP:
-        return super().mlp(num_outputs).clone(layer_norm=self.layer_norm, may_narrow=True)
+        return super().mlp(num_outputs).clone(layer_norm=self.layer_norm)
 
 
 class TD3State(struct.PyTreeNode):

@@ -24,7 +24,7 @@ class TaskConfig(Protocol):
     def make(self) -> "Task": ...
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, init=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Task(TaskSpec):
     """A real task: its spec, and the environment that agents are tested on.
 
@@ -60,24 +60,15 @@ class Task(TaskSpec):
 
     name: str
     env: Environment
-    params: EnvParams
-    origin: Mapping[str, object] | None
+    params: EnvParams = None  # type: ignore[assignment]
+    max_steps: int = None  # type: ignore[assignment]
+    origin: Mapping[str, object] | None = None
     observation: Space = field(init=False)  # of `env`, so that `dataclasses.replace` may change it
     action: Space = field(init=False)
 
-    def __init__(
-        self,
-        *,
-        name: str,
-        env: Environment,
-        params: EnvParams | None = None,
-        solved_reward: float = math.inf,
-        max_steps: int | None = None,
-        info_keys: tuple[str, ...] = (),
-        augmented_keys: tuple[str, ...] = (),
-        origin: Mapping[str, object] | None = None,
-    ):
-        solved_reward = options.as_python(solved_reward)
+    def __post_init__(self) -> None:
+        params, env, name = self.params, self.env, self.name
+        solved_reward = options.as_python(self.solved_reward)
         is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
         options.require(  # it may be traced
             not is_nan and not isinstance(solved_reward, str | None),
@@ -87,7 +78,7 @@ class Task(TaskSpec):
         )
         with _one_error(name):
             params = env.default_params if params is None else params
-            limit = params.max_steps_in_episode if max_steps is None else max_steps
+            limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = options.as_python(limit)
             options.counts()("env.max_steps", max_steps, 200)
             if params.max_steps_in_episode != max_steps:
@@ -96,16 +87,14 @@ class Task(TaskSpec):
             vectors, observation, action = as_vectors(env, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # seconds for some, which have their own tests
-        super().__init__(
+        vars(self).update(
+            env=vectors,
+            params=params,
             observation=observation,
             action=action,
             max_steps=int(max_steps),
             solved_reward=solved_reward,
-            info_keys=info_keys,
-            augmented_keys=augmented_keys,
         )
-        # As the generated `__init__` of a frozen dataclass does, but all at once.
-        vars(self).update(name=name, env=vectors, params=params, origin=origin)
 
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":

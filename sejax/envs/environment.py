@@ -179,7 +179,7 @@ def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
     if isinstance(space, spaces.Box):
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
-        return Box(low, high, tuple(space.shape) if len(space.shape) == 3 else ())
+        return Box(low, high)
     raise ConfigError(
         f"env must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}. "
         "Make them one array in a subclass of sejax.envs.wrappers.Wrapper.",

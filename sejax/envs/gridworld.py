@@ -17,7 +17,6 @@ from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.spec import Discrete, TaskSpec
 from sejax.options import Options, finite, option
 
-CELLS = "S GO#"  # start, floor, goal, hole, wall
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 CLIFF_WALKING = (
     "            ",
@@ -66,17 +65,11 @@ class GridWorld(Environment[GridState, GridParams]):
         """Reads a map.
 
         Args:
-          rows: strings of equal length, of the characters `CELLS`: one S where episodes start,
-            G for goals, O for holes, # for walls and a space for floor.
+          rows: strings of equal length: one S where episodes start, G for goals, O for holes, # for
+            walls and a space for floor.
           params: `default_params`; those of `GridParams` if not given.
-
-        Raises:
-          ValueError: if the map is no rectangle of these characters with one S.
         """
-        cells = np.array([list(row.ljust(max(map(len, rows)), "?")) for row in rows])
-        wrong = {*cells.flat} - {*CELLS}
-        if wrong or np.sum(cells == "S") != 1:
-            raise ValueError(f"rows must have one length, one S and else {list(CELLS)}; got {rows}")
+        cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._default_params = params or GridParams()
         self._start = int(np.flatnonzero(cells == "S")[0])
@@ -160,5 +153,4 @@ class GridWorld2x2:
     )
 
     def make(self) -> Task:
-        params = GridParams(step_reward=-0.01, goal_reward=1.0, hole_reward=-1.0)
-        return Task.of(self.spec, name="gridworld_2x2", env=GridWorld(ROOM_2X2, params))
+        return Task.of(self.spec, name="gridworld_2x2", env=GridWorld(ROOM_2X2))

@@ -26,12 +26,10 @@ class Box:
 
     Attributes:
       low, high: the bounds.
-      image: rows, columns and channels, if the vectors are images, row by row; else empty.
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    image: tuple[int, ...] = ()
 
     @classmethod
     def symmetric(cls, *high: float) -> "Box":
@@ -89,8 +87,7 @@ class TaskSpec:
         """What agents see, as plain values that a proxy's file keeps.
 
         `observation` and `action` are `{"n": categories}` or the bounds of a vector, `{"low": [x],
-        "high": [x]}` with None where there is none, and the shape `image` of images; `max_steps` is
-        the step limit.
+        "high": [x]}` with None where there is none; `max_steps` is the step limit.
         """
         return {
             "observation": _plain(self.observation),
@@ -129,11 +126,6 @@ class TaskSpec:
         return self.action.n if isinstance(self.action, Discrete) else None
 
     @property
-    def image(self) -> tuple[int, ...]:
-        """Rows, columns and channels of observations that are images; else empty."""
-        return self.observation.image if isinstance(self.observation, Box) else ()
-
-    @property
     def action_dim(self) -> int:
         """Length of the action that networks see; a discrete one is one-hot to them."""
         return self.action.size
@@ -149,11 +141,10 @@ def _plain(space: Space) -> dict[str, Any]:
     if isinstance(space, Discrete):
         return {"n": space.n}
     bounds = {"low": space.low, "high": space.high}
-    plain: dict[str, Any] = {
+    return {
         name: [float(np.float32(x)) if math.isfinite(x) else None for x in bound]
         for name, bound in bounds.items()
     }
-    return plain | ({"image": list(space.image)} if space.image else {})
 
 
 def _space_of(plain: Mapping[str, Any]) -> Space:
@@ -164,4 +155,4 @@ def _space_of(plain: Mapping[str, Any]) -> Space:
         tuple(end if x is None else float(x) for x in plain[name])
         for name, end in (("low", -math.inf), ("high", math.inf))
     )
-    return Box(low, high, tuple(plain.get("image", ())))
+    return Box(low, high)

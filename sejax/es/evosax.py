@@ -5,7 +5,7 @@ This is the one place where a sign is turned: evosax minimises a fitness, scores
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import optax
@@ -18,29 +18,16 @@ if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
 
 
-class Algorithm(NamedTuple):
-    """One of evosax's algorithms.
-
-    Attributes:
-      cls: name of its class; importing evosax takes a second.
-      antithetic: whether the second half of its candidates is the first mirrored.
-      optimizer: of its mean, "adam" or "sgd" (for steps that have a natural scale); None if it
-        takes none.
-    """
-
-    cls: str
-    antithetic: bool
-    optimizer: str | None
-
-
+# Name of the class; whether the second half of its candidates is the first mirrored; the optimizer
+# of its mean, "adam" or "sgd" (for steps that have a natural scale), None if it takes none.
 ALGORITHMS = {
-    "cma_es": Algorithm("CMA_ES", antithetic=False, optimizer=None),
-    "cr_fm_nes": Algorithm("CR_FM_NES", antithetic=True, optimizer=None),
-    "open_es": Algorithm("Open_ES", antithetic=True, optimizer="adam"),
-    "pgpe": Algorithm("PGPE", antithetic=True, optimizer="adam"),
-    "sep_cma_es": Algorithm("Sep_CMA_ES", antithetic=False, optimizer=None),
-    "snes": Algorithm("SNES", antithetic=False, optimizer="sgd"),
-    "xnes": Algorithm("xNES", antithetic=False, optimizer="sgd"),
+    "cma_es": ("CMA_ES", False, None),
+    "cr_fm_nes": ("CR_FM_NES", True, None),
+    "open_es": ("Open_ES", True, "adam"),
+    "pgpe": ("PGPE", True, "adam"),
+    "sep_cma_es": ("Sep_CMA_ES", False, None),
+    "snes": ("SNES", False, "sgd"),
+    "xnes": ("xNES", False, "sgd"),
 }
 
 

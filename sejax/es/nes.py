@@ -16,8 +16,6 @@ from sejax.es.score_transforms import OwnTransform, require_transform, transform
 from sejax.ops.scores import or_lowest
 from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
-UPDATE_RULES = ("authors", "paper")
-
 
 @dataclass(frozen=True, kw_only=True)
 class NESConfig(StrategyOptions):
@@ -49,7 +47,7 @@ class NESConfig(StrategyOptions):
     step_size_decay: float = option(1.0, shrinks())
     mirrored: bool = True
     score_transform: str | OwnTransform = option("all_better_2", require_transform, names_code=True)
-    update_rule: str = option("authors", one_of(UPDATE_RULES))
+    update_rule: str = option("authors", one_of(("authors", "paper")))
     weight_decay: float = option(0.0, fraction())
 
     def make(self, num_dims: int) -> Strategy:

@@ -152,7 +152,7 @@ class MLP(nn.Module):
     (proxies: the authors' NES perturbs the weights and biases of linear layers only). `layer_norm`
     normalises each column over the units of every hidden layer but the first, before the
     activation; its scale and bias are learned and, as in the authors' code, the same in all layers.
-    With `may_narrow` it knows how many units `narrow` has left.
+    It knows how many units `narrow` has left.
 
     Source: paper, appendix "SE hyperparameters"; `docs/reference.md` 1.10 and 1.11.
     """
@@ -163,7 +163,6 @@ class MLP(nn.Module):
     activation: str
     learn_prelu_slope: bool = False
     layer_norm: bool = False
-    may_narrow: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "out *batch"]:
@@ -182,8 +181,6 @@ class MLP(nn.Module):
         normalize = nn.LayerNorm(
             epsilon=1e-5, reduction_axes=0, feature_axes=0, use_fast_variance=False
         )
-        if not self.may_narrow:
-            return normalize
         # A parameter that never changes: rounded, as averaging it into a target network may not.
         width = self.param("width", nn.initializers.constant(self.hidden_size), ())
         in_use = jnp.arange(self.hidden_size) < jnp.round(jax.lax.stop_gradient(width))
@@ -221,13 +218,11 @@ def narrow(params: dict[str, PyTree], hidden_size: Array) -> dict[str, PyTree]:
     and its weights are distributed as those of a network that was made so.
 
     Args:
-      params: of an `MLP`; or of a `DuelingMLP`, whose shared part is narrowed; or of `OnImages`,
-        whose network is.
+      params: of an `MLP`; or of a `DuelingMLP`, whose shared part is narrowed.
       hidden_size: `[]`, at most the network's.
     """
-    for name in ("network", "features"):
-        if name in params:
-            return {**params, name: narrow(params[name], hidden_size)}
+    if "features" in params:
+        return {**params, "features": narrow(params["features"], hidden_size)}
     num_layers = sum(name.startswith("Dense_") for name in params)
     full_size = params["Dense_0"]["bias"].shape[0]
     in_use = jnp.arange(full_size) < hidden_size
@@ -277,29 +272,3 @@ class DuelingMLP(nn.Module):
         value = mlp(1, **hidden, name="value")(features)  # [1, *batch]
         advantage = mlp(self.num_actions, **hidden, name="advantage")(features)
         return value + advantage - jnp.mean(advantage, axis=0, keepdims=True)
-
-
-class OnImages(nn.Module):
-    """A convolution before a network: filters of 3 x 3 pixels without padding, then ReLU.
-
-    Plain form: `flax.linen.Conv` (`tests/test_networks.py`). It is written as a product with the
-    pixels that each filter sees, which is `affine`, under `vmap` over agents too.
-
-    Source: Young and Tian, "MinAtar" (2019), section 3, whose networks have 16 filters and one
-    hidden layer of 128 units.
-    """
-
-    image: tuple[int, ...]  # rows, columns and channels of an input, which is row by row
-    num_filters: int
-    network: nn.Module
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "out *batch"]:
-        batch, (rows, columns, _) = x.shape[1:], self.image
-        pixels = jnp.moveaxis(x.reshape(*self.image, *batch), 2, 0)
-        inner = (rows - 2, columns - 2)
-        seen = [pixels[:, i : i + inner[0], j : j + inner[1]] for i in range(3) for j in range(3)]
-        patches = jnp.concatenate(seen)  # [9 channels, rows, columns, *batch]
-        filtered = Dense(self.num_filters, name="filters")(patches.reshape(len(patches), -1))
-        outputs: Array = self.network(nn.relu(filtered).reshape(-1, *batch))
-        return outputs

@@ -26,7 +26,6 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 import contextlib
 import dataclasses
 import inspect
-import numbers
 import os
 import re
 import sysconfig
@@ -183,30 +182,26 @@ class Options:
     """
 
     group: ClassVar[str] = ""
-    removed: ClassVar[tuple[tuple[str, Any], ...]] = ()
+    removed: ClassVar[dict[str, Any]] = {}
 
     def __post_init__(self) -> None:
-        check(self, self.group)
+        """Checks all fields that have a rule.
 
+        Numbers of NumPy and jax become Python's, and whole numbers floats where the default is one,
+        so that equal configurations are the same program.
 
-def check(config: Options, group: str) -> None:
-    """Checks all fields of a dataclass that have a rule.
-
-    Numbers of NumPy and jax become Python's, and whole numbers floats where the default is one, so
-    that equal configurations are the same program.
-
-    Raises:
-      ConfigError: for the first one that does not hold.
-    """
-    for field in dataclasses.fields(config):
-        value = as_python(getattr(config, field.name))
-        if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
-            value = float(value)
-        object.__setattr__(config, field.name, value)
-        rule = marks(type(config), field.name).get("rule")
-        may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
-        if rule is not None and not (value is None and may_be_none):
-            rule(f"{group}.{field.name}" if group else field.name, value, field.default)
+        Raises:
+          ConfigError: for the first one that does not hold.
+        """
+        for field in dataclasses.fields(self):
+            value = as_python(getattr(self, field.name))
+            if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
+                value = float(value)
+            object.__setattr__(self, field.name, value)
+            rule = marks(type(self), field.name).get("rule")
+            may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
+            if rule is not None and not (value is None and may_be_none):
+                rule(f"{self.group}.{field.name}".lstrip("."), value, field.default)
 
 
 def traced_options(config: Options) -> dict[str, Any]:
@@ -263,11 +258,9 @@ def as_python(value: Any) -> Any:
     if getattr(value, "shape", None) != () or not hasattr(value, "item"):
         return value
     try:
-        number = value.item()
+        return value.item()
     except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
         return value
-    is_python = type(number) in (bool, int, float) or not isinstance(number, numbers.Real)
-    return number if is_python else float(number)  # such as a long double
 
 
 # --- rules ---------------------------------------------------------------------------------------

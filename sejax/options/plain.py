@@ -74,9 +74,9 @@ def from_plain(
         ) from error
     defaults, fields = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
-    removed = getattr(cls, "removed", ())
+    removed = getattr(cls, "removed", {})
     for name, value in values.items():
-        if (name, value) in removed:
+        if name in removed and removed[name] == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())

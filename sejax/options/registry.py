@@ -34,14 +34,12 @@ import importlib.util
 import inspect
 import operator
 import re
-import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from sejax.options import (
     ConfigError,
     Options,
-    nearest,
     place_of,
     require,
     shortened,
@@ -347,16 +345,10 @@ def imported(field: str, path: str) -> Any:
         name.
     """
     require_path(field, path)
-    module, _, attribute = path.partition(":")
     try:
         return _attribute(path)
     except Exception as error:
-        members = vars(sys.modules.get(module, object)).items()
-        plugins = {name: x for name, x in members if _makes(x) or inspect.isfunction(x)}
-        known = [name for name, x in plugins.items() if x.__module__ == module]
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
-        if known:
-            hint = f" Did you mean {field}={module}:{nearest(attribute, known)[0]}?"
         got = shortened(path, 60)
         message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
         raise ConfigError(message, field) from error

@@ -6,7 +6,6 @@ executed, resolved or imported when it is read. `sejax.proxies.io` makes environ
 `sejax.gym` some for Gymnasium.
 """
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -101,12 +100,11 @@ class Stored(NamedTuple):
 
 
 def _sizes_of(space: Space) -> list[int]:
-    """The numbers that count something in a space; 0 if its bounds or its shape do not fit."""
+    """The numbers that count something in a space; 0 if its bounds do not fit."""
     if not isinstance(space, Box):
         return [space.n]
-    is_image = len(space.image) == 3 and math.prod(space.image) == space.size
     are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
-    return [space.size * are_bounds * (is_image or not space.image), *space.image]
+    return [space.size * are_bounds]
 
 
 def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:

@@ -46,8 +46,6 @@ from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, r
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
-EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
-TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
@@ -238,8 +236,8 @@ class EvaluateConfig(CommandConfig):
     proxy: str
     env: str | None = option(None, names_code=True)
     proxy_kind: str | None = option(None, names_code=True)
-    agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
-    training_from: str = option("proxy", one_of(TRAINING_FROM))
+    agent_hparams: str = option("default", one_of((*AGENT_HPARAMS, "as_learned")))
+    training_from: str = option("proxy", one_of(("proxy", "config")))
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
     baseline: bool = True
     out_dir: str | None = None
@@ -361,7 +359,7 @@ def _from_plain(
     is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
     message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
     require(is_map and several, "agents", message)
-    of_mixture = fields_of(MixtureConfig) if schema.learns else ()
+    of_mixture = (*fields_of(MixtureConfig), *MixtureConfig.removed) if schema.learns else ()
     shared = {name: several[name] for name in of_mixture if name in several}
     keys, weights = sorted(several.keys() - shared.keys()), []
     objects["agents"] = {}

@@ -1,7 +1,7 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from typing import Any, Self
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -14,51 +14,20 @@ from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, Reporter
 
 
-class _Line(Progress):
-    """One line that changes on a terminal, and nothing elsewhere.
+class RunProgress(Progress, Reporter):
+    """One live line on a terminal; one line for each generation elsewhere.
 
     Attributes:
       is_live: whether it is on a terminal.
     """
 
-    def __init__(self, text: str, total: int, things: str = "", **options: Any):
+    def __init__(self, config: LearnConfig):
         console = Console(highlight=False, markup=False)
         self.is_live = console.is_terminal
-        columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn(text), TextColumn("left")
-        left = TimeRemainingColumn(elapsed_when_finished=False)
-        super().__init__(*columns, left, console=console, disable=not self.is_live, **options)
-        self._task, self._total = self.add_task(things, total=total), total
-
-
-class Tally(_Line):
-    """One live line on a terminal: how many are done of all, and the time left.
-
-    Elsewhere one line says what is being done.
-
-    Example:
-      >>> with Tally(20, "agents on the proxy") as tally:
-      ...     tally.add(5)
-      training 20 agents on the proxy ...
-    """
-
-    def __init__(self, total: int, things: str):
-        counted = "{task.completed:,.0f}/{task.total:,.0f} {task.description}"
-        super().__init__(counted, total, things, transient=True)
-        if not self.is_live:
-            print(f"training {total:,} {things} ...", flush=True)
-
-    def add(self, count: int = 1) -> None:
-        """Counts what is done, from any thread; there are no more than all."""
-        self.update(self._task, advance=count)
-        if self.tasks[0].completed > self._total:
-            self.update(self._task, completed=self._total)
-
-
-class RunProgress(_Line, Reporter):
-    """One live line on a terminal; one line for each generation elsewhere."""
-
-    def __init__(self, config: LearnConfig):
-        super().__init__("{task.description}", config.generations)
+        columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn("{task.description}")
+        left = TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False)
+        super().__init__(*columns, *left, console=console, disable=not self.is_live)
+        self._task = self.add_task("", total=config.generations)
         self._config, self._started, self._steps = config, time.monotonic(), 0
 
     def __enter__(self) -> Self:

@@ -11,8 +11,7 @@ import jax
 from jax._src import xla_bridge
 
 from sejax.ops import files
-from sejax.options import require
-from sejax.training import require_modes
+from sejax.training import require_32_bits
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: "200000 100000", or "max 100000"
 _NEVER_SECONDS = 1_000_000
@@ -87,11 +86,9 @@ def configure_jax() -> None:
     features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
 
     Raises:
-      ConfigError: for a mode of jax in which programs of sejax fail.
+      ConfigError: if jax computes in 64 bits.
     """
-    require_modes()
-    must = "must be false, as commands compile their programs; got true. Set JAX_DISABLE_JIT=0."
-    require(not jax.config.jax_disable_jit, "jax_disable_jit", must)
+    require_32_bits()
     if jax.config.jax_default_matmul_precision is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     root = files.cache_folder()

@@ -23,20 +23,16 @@ class World(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """Which agents train where.
+    """Where agents train and are tested.
 
     Attributes:
       task: the real task, on which all are tested.
       worlds: by name, the first one first in tables.
-      agents: by their keys.
-      exploration: of all of them.
       out_dir: where the files go.
     """
 
     task: envs.Task
     worlds: dict[str, World]
-    agents: dict[str, AgentConfig]
-    exploration: Any
     out_dir: Path
 
 
@@ -50,7 +46,7 @@ def real_setup(config: EvaluateConfig) -> Setup:
     trainings = dict.fromkeys(config.agents, config.real_training)
     worlds = {"the real task": World(task.env, task.params, trainings)}
     folder = Path(config.out_dir or f"runs/evaluate-{as_file_name(task.name)}")
-    return Setup(task, worlds, config.agents, config.exploration, folder)
+    return Setup(task, worlds, folder)
 
 
 def proxy_setup(config: EvaluateConfig) -> Setup:
@@ -77,7 +73,7 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
         name = as_file_name(config.proxy.removeprefix(hub.SCHEME))
         beside = Path("runs", f"evaluate-{name}")
     folder = Path(config.out_dir or beside)
-    return Setup(task, worlds, config.agents, config.exploration, folder)
+    return Setup(task, worlds, folder)
 
 
 def _load(config: EvaluateConfig) -> Proxy:

@@ -6,8 +6,6 @@ import functools
 import hashlib
 import os
 import platform
-import shlex
-import shutil
 import subprocess
 import tempfile
 import threading
@@ -22,7 +20,6 @@ from sejax.options import ConfigError, shortened, told
 
 SOURCE = Path(__file__).with_name("step.cc")
 FLAGS = ("-O2", "-std=c++17", "-shared", "-fPIC")
-COMPILERS = ("c++", "g++", "clang++")  # tried in this order, after $CXX
 TARGETS = {"sejax_mujoco_reset": "SejaxMujocoReset", "sejax_mujoco_step": "SejaxMujocoStep"}
 _LOADING = threading.Lock()
 
@@ -70,7 +67,7 @@ def _load() -> ctypes.CDLL:
 def file_name() -> str:
     """What the library is called: there is one for each version of all that it is made of."""
     versions = f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}"
-    source, options = SOURCE.read_text(encoding="utf-8"), (*FLAGS, *_given_compiler()[1:])
+    source, options = SOURCE.read_text(encoding="utf-8"), (*FLAGS, *compiler()[1:])
     parts = (source, *options, versions, platform.system(), *platform.libc_ver())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return f"{versions}-{digest}.so"
@@ -83,12 +80,12 @@ def build(path: Path) -> None:
     MuJoCo is bound by its file's name alone, as the process has it loaded already.
 
     Raises:
-      BuildError: if there is no compiler, or it fails.
+      BuildError: if the compiler is not there, or fails.
     """
     package = Path(mujoco.__file__).parent
     mujoco_library = min(package.glob("libmujoco*"))
     includes = f"-I{package / 'include'}", f"-I{jax.ffi.include_dir()}"
-    command = [*_compiler(), *FLAGS, *includes, str(SOURCE), str(mujoco_library), "-o", str(path)]
+    command = [*compiler(), *FLAGS, *includes, str(SOURCE), str(mujoco_library), "-o", str(path)]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
@@ -96,22 +93,9 @@ def build(path: Path) -> None:
         raise BuildError(f"{command[0]} failed with: {said}. Mend that, or set CXX") from error
 
 
-def _compiler() -> list[str]:
+def compiler() -> list[str]:
     """The command of a C++ compiler, with the options that `CXX` may have."""
-    for command in (_given_compiler(), *([name] for name in COMPILERS)):
-        if command and shutil.which(command[0]):
-            return command
-    raise BuildError(
-        f"no C++ compiler was found, none of $CXX, {', '.join(COMPILERS)}. Install one, such as g++"
-    )
-
-
-def _given_compiler() -> list[str]:
-    command = os.environ.get("CXX", "")
-    try:
-        return shlex.split(command)
-    except ValueError as error:
-        raise BuildError(f"CXX is no command, {command} ({error}). Set it to one") from error
+    return (os.environ.get("CXX") or "c++").split()
 
 
 def _register(path: Path) -> ctypes.CDLL:

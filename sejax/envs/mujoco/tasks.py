@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # it imports mujoco
 
 # Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
 # MuJoCo, at ten times its cost on a CPU (docs/mujoco.md).
-BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
+BACKENDS = ("mujoco", "mjx", "spring")
 
 # The entries of `info` that describe the state alone; an observation has no position along x or y.
 _STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
