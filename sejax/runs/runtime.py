@@ -11,7 +11,7 @@ import jax
 from jax._src import xla_bridge
 
 from sejax.ops import files
-from sejax.training import require_32_bits
+from sejax.training import require_modes
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: "200000 100000", or "max 100000"
 _NEVER_SECONDS = 1_000_000
@@ -88,7 +88,7 @@ def configure_jax() -> None:
     Raises:
       ConfigError: if jax computes in 64 bits.
     """
-    require_32_bits()
+    require_modes()
     if jax.config.jax_default_matmul_precision is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     root = files.cache_folder()
