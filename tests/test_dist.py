@@ -4,7 +4,6 @@ The wheel is installed into an environment of its own, and all that is run there
 that is not the repository.
 """
 
-import email
 import os
 import re
 import shutil
@@ -110,16 +109,6 @@ def test_the_sdist_holds_the_package_and_what_builds_it_alone():
     beside = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "SECURITY.md",
               "pyproject.toml"}  # fmt: skip
     assert names - made == of_git("sejax") | beside
-
-
-def test_the_metadata_are_those_of_the_repository(wheel):
-    (text,) = (x for name, x in wheel.items() if name.endswith(".dist-info/METADATA"))
-    metadata = email.message_from_bytes(text)
-    version = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
-    assert metadata["Version"] == sejax.__version__ == version[1]
-    assert metadata["License-Expression"] == "Apache-2.0"
-    (licence,) = (x for name, x in wheel.items() if name.endswith("/licenses/LICENSE"))
-    assert licence == (ROOT / "LICENSE").read_bytes()
 
 
 # --- what they do, bare --------------------------------------------------------------------------

@@ -271,17 +271,6 @@ def test_a_fault_in_code_of_ones_own_is_told_with_its_place(step_env):
     assert f"test_gymnax_tasks.py:{line}: {source[:60]}" in said and "Derive it" not in said
 
 
-def test_limits_may_be_numbers_of_numpy_and_jax():
-    assert Task(name="mine", env=Plain(), params=Limit(jnp.int32(4))).max_steps == 4
-    assert type(Task(name="mine", env=Plain(), max_steps=np.int64(7)).max_steps) is int
-
-
-def test_a_wrapper_whose_step_would_never_be_called_is_refused_as_a_proxy_too():
-    agent = sejax.make_agent(sejax.DDQNConfig(), Task(name="plain", env=cartpole.CartPole()))
-    wrapper = StickyActionWrapper(cartpole.CartPole(), 1.0)
-    assert refused(sejax.make_trainer, agent, wrapper) == "env"
-
-
 def test_a_wrapper_that_hands_on_what_it_does_not_change_is_taken():
     class Half:
         def __init__(self, env):

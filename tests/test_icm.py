@@ -197,12 +197,6 @@ def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kin
 # --- the rest of the agent -----------------------------------------------------------------------
 
 
-def test_a_fresh_module_has_the_configured_numbers():
-    agent = curious("index")
-    expected = {"learning_rate": 0.01, "forward_weight": 0.3, "reward_scale": 0.5, "agent": ()}
-    assert vars(agent.hparams) == expected
-
-
 def test_a_curious_agent_trains_alone_on_a_core():
     # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
     task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)

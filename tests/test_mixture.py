@@ -1,6 +1,5 @@
 """sejax.agents.mixture: candidates that are divided among agents, and how their scores combine."""
 
-import dataclasses
 import re
 from types import SimpleNamespace
 
@@ -16,9 +15,8 @@ from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
-from sejax.objectives import MaxReward, Outcome
+from sejax.objectives import Outcome
 from sejax.options import registry
-from sejax.scoring import Scoring
 from sejax.training import TrainingConfig
 
 NAN, INF = np.nan, np.inf
@@ -138,11 +136,6 @@ def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing(by):
     assert got[0] == got[2] == 0 and got[1] < 0 < got[3]
 
 
-def scoring_of(weights, es, **config):
-    agents = mixture(len(weights), weights=weights, **config)
-    return Scoring.of(MaxReward().make(TASK), es.make(4), agents)
-
-
 def outcome_of(returns):
     """The outcome of agents with these test returns; nan for those that diverged."""
     returns = jnp.float32(returns)
@@ -151,27 +144,6 @@ def outcome_of(returns):
         test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
         train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("aggregate", "weights", "score"),
-    [
-        ("mean", (1.0, 1.0), (200 + 10) / 2),
-        ("mean", (2.0, 1.0), (200 + 10) / 2),
-        ("min", (1.0, 0.5, 1.0), 10),
-        ("mean", (1.0, 1.0, 0.0), (200 + 10 + 140) / 3),  # an agent of weight 0 judges
-    ],
-)
-def test_an_incumbents_score_aggregates_the_means_of_its_agents(aggregate, weights, score):
-    es = NESConfig(population_size=4, num_incumbent_evals=len(weights))
-    scoring = scoring_of(weights, es, aggregate=aggregate)
-    means = [200.0, 10.0, 140.0][: len(weights)]
-    scores = scoring.judged(outcome_of([7.0] * 8 + means))
-    np.testing.assert_allclose(scores.incumbent_mean, score, rtol=1e-6)
-    # People see returns.
-    np.testing.assert_array_equal(scores.agent_means, means)
-    np.testing.assert_array_equal(scores.incumbent, means)
-    np.testing.assert_array_equal(scores.population, [7.0] * 8)
 
 
 # --- Algorithm 1 ---------------------------------------------------------------------------------
@@ -318,31 +290,3 @@ def test_an_incumbent_that_one_agent_never_survived_is_never_the_best(aggregate)
     assert (after.best_generation, after.best_score, after.solved) == (-1, -INF, False)
     np.testing.assert_array_equal(after.incumbent_scores, [1e6, -INF])
     np.testing.assert_array_equal(info.by_agent.num_nonfinite, [0, 1])
-
-
-# --- what the compiler makes ---------------------------------------------------------------------
-
-
-def test_two_agents_are_one_program_with_a_training_loop_for_each():
-    task = envs.make("cartpole")
-    config = sejax.DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
-    sizes = (31, 37)  # rows of the replay buffers, which tell the loops apart
-    agents = tuple(
-        sejax.make_agent(dataclasses.replace(config, buffer_size=size), task) for size in sizes
-    )
-    bilevel = make_bilevel(
-        task=task, agent=Mixture(agents=agents), proxy=paper_se(hidden_size=4),
-        es=NESConfig(population_size=23, num_incumbent_evals=23), devices=2, num_parallel=1,
-        training=dataclasses.replace(TRAINING, max_steps=40),
-    )  # fmt: skip
-    lowered = jax.jit(bilevel.generation).lower(jax.eval_shape(bilevel.init, KEY))
-    hlo = lowered.compile().as_text()
-    assert "num_partitions=2" in hlo.splitlines()[0]
-    loops = [line for line in hlo.splitlines() if re.search(r"\) while\(", line)]
-    for size in sizes:
-        assert sum(f"f32[{size},11]" in line for line in loops) == 1
-    assert not any(all(f"f32[{size},11]" in line for size in sizes) for line in loops)
-    # No training pays for another agent's: a device runs half of 24 candidates and 12 incumbents
-    # of the first, and of 22 and 12 of the second. Shorter loops draw random numbers.
-    trips = [int(n) for line in loops for n in re.findall(r'known_trip_count.*?"n":"(\d+)"', line)]
-    assert {17, 18} <= set(trips) and 35 not in trips

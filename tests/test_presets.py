@@ -10,7 +10,6 @@ from support import paper_training, refused
 
 import sejax
 from experiments.common.reward_networks import STUDIES
-from sejax.agents.ppo import PPOConfig
 from sejax.options import registry
 from sejax.runs import preset_files
 
@@ -96,11 +95,6 @@ def test_the_best_preset_has_a_quick_ppo_for_mountain_car_continuous():
         assert dataclasses.replace(quick, **freed) == study.transfer_agent
 
 
-@pytest.mark.parametrize("env", ["cartpole", "mountain_car", "mountain_car_continuous"])
-def test_ppo_on_ses_is_the_default(env):
-    assert composed_with(f"env={env}", "agent=ppo").agent == PPOConfig()
-
-
 # --- the files -----------------------------------------------------------------------------------
 
 
@@ -120,15 +114,6 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
             assert name in preset_files.names()
             for group in ("agent", "es", "objective"):
                 assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
-
-
-def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():
-    words = "env=cartpole", "proxy=rn"
-    paper, best = (composed_with(*words, f"preset={name}") for name in ("paper", "best"))
-    assert paper.proxy.variant == "additive_potential"
-    assert best.proxy.variant == "exclusive_potential"
-    assert paper.agent == best.agent and paper.training == best.training
-    assert (paper.es.step_size, best.es.step_size) == (0.5, 0.5)
 
 
 @pytest.mark.parametrize("proxy", ["se", "rn"])

@@ -122,13 +122,6 @@ def test_weights_are_finite_bounded_and_never_fall_with_the_score(name, scores, 
     assert (np.diff(ordered) >= -1e-5).all()
 
 
-@pytest.mark.parametrize("name", ["linear", "rank", "nes", "nes_unnormalized", "single_best"])
-@given(scores=scores_lists, incumbents=st.tuples(finite_scores, finite_scores))
-def test_transforms_that_do_not_compare_ignore_the_incumbent(name, scores, incumbents):
-    a, b = (transform(name, scores, incumbent) for incumbent in incumbents)
-    np.testing.assert_array_equal(a, b)
-
-
 @pytest.mark.parametrize("name", ["single_better", "all_better_1", "all_better_2"])
 @given(scores=scores_lists, incumbent=finite_scores)
 def test_only_members_better_than_the_incumbent_weigh(name, scores, incumbent):

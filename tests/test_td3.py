@@ -184,14 +184,6 @@ def test_targets_start_as_copies_and_the_critics_apart(config):
 # --- the Gumbel-Softmax --------------------------------------------------------------------------
 
 
-def test_gumbel_softmax_by_hand():
-    logits, gumbel = jnp.array([0.0, 1.0]), jnp.array([0.5, np.log(2.0) - 0.5])
-    # The sums differ by ln 2: shares 1 : 2 at temperature 1, 1 : 4 at temperature 1/2.
-    np.testing.assert_allclose(gumbel_softmax(logits, gumbel, 1.0, False), [1 / 3, 2 / 3], 1e-6)
-    np.testing.assert_allclose(gumbel_softmax(logits, gumbel, 0.5, False), [0.2, 0.8], 1e-6)
-    np.testing.assert_array_equal(gumbel_softmax(logits, gumbel, 0.5, True), [0.0, 1.0])  # exact
-
-
 def test_a_final_temperature_of_zero_gives_finite_samples_and_gradients():
     hparams = agent_of(DISCRETE).hparams.replace(final_temperature=0.0)
     gumbel, weights = np.float32([-2.0, 17.0, 0.0]), np.float32([1.0, 2.0, 3.0])

@@ -2,20 +2,19 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import random_columns
+from support import assert_close, random_columns
 
 import sejax
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, Draw, Varied, drawing_key
-from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
+from sejax.agents.base import drawing_key
+from sejax.agents.buffers import Transition, block_size, sum_over_batch
 from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
@@ -219,24 +218,6 @@ def test_every_drawn_agent_finds_a_network_with_room():
     assert len(set(draws.variant.tolist())) == len(varied.varied.agents)
 
 
-def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
-    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
-    varied = make_agent(config, envs.make("cartpole"), varied=True)
-    key = jax.random.key(3)
-    drawn, values = jax.jit(
-        lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key))
-    )(key)
-    assert drawn.values == values
-    hparams = vars(drawn.hparams)
-    for name in ("learning_rate", "batch_size", "hidden_size"):
-        assert hparams.pop(name) == values[name]
-    assert hparams.pop("discount") == 0.9  # what is not varied stays as it was configured
-    # Room for the largest batch is in all variants; the agent itself is the configured one.
-    plain = make_agent(config, envs.make("cartpole"))
-    assert varied.hparams == plain.hparams and plain.drawn_values(key) == {}
-    assert plain.varied is None
-
-
 def test_the_agent_inside_an_exploring_one_is_varied():
     varied = make_agent(QLearningConfig(), envs.make("gridworld_2x2"), CountBasedConfig(), True)
     (variant,) = varied.varied.agents
@@ -247,54 +228,20 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
-class Numbers(NamedTuple):
-    rate: float
-
-
-def agent_that(name, **fields):
-    """An agent of which nothing but its identity matters."""
-    return Agent(
-        init=lambda key, hparams: name, act=None, update=None, buffer=no_buffer(),
-        hparams=Numbers(rate=1.0), **fields,
-    )  # fmt: skip
-
-
-# --- whole programs ------------------------------------------------------------------------------
-
-
-def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it():
-    plain = agent_that("has its own numbers")
-    variants = (agent_that("is the first"), agent_that("is the second"))
-    values = {"rate": jnp.array([0.25, 4.0])}
-
-    def draw(key):
-        index = jax.random.randint(key, (), 0, 2)
-        rate = values["rate"][index]
-        return Draw(variant=index, hparams=Numbers(rate), values={"rate": rate})
-
-    varied = dataclasses.replace(plain, varied=Varied(agents=variants, draw=draw))
-    built = []
-
-    def make_run(agent):
-        built.append(agent)
-        which = jnp.int32([plain, *variants].index(agent))
-        return lambda key, x, hparams: (which, hparams.rate * x, jax.random.bits(key))
-
-    keys = jax.random.split(jax.random.key(0), 12)
-    run = jax.jit(varied.fresh(make_run))
-    seen = set()
-
-    @jax.jit
-    def expected(key):  # the run has the training's own key
-        return draw(drawing_key(key)), varied.drawn_values(key), jax.random.bits(key)
-
-    for key in keys:
-        which, scaled, bits = run(key, np.float32(3.0))
-        drawn, values_of_key, expected_bits = expected(key)
-        assert (which, scaled) == (drawn.variant + 1, 3.0 * drawn.hparams.rate)
-        assert bits == expected_bits and values_of_key == drawn.values
-        seen.add(int(which))
-    assert seen == {1, 2} and built == list(variants)
-    # An agent that nothing is drawn for runs with its own.
-    which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
-    assert (which, scaled) == (0, 3.0)
+def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key():
+    task = envs.make("cartpole")
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9, warmup_episodes=1)
+    varied = make_agent(config, task, varied=True)
+    training = sejax.TrainingConfig(max_steps=60, stop_rule="never")
+    train = jax.jit(sejax.make_evaluator(varied, task.env, task, training))
+    draw = jax.jit(lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key)))
+    key = jax.random.key(0)
+    drawn, values = draw(key)
+    assert drawn.variant > 0 and drawn.values == values
+    for name in ("learning_rate", "batch_size", "hidden_size"):
+        assert getattr(drawn.hparams, name) == values[name]
+    assert drawn.hparams.discount == 0.9  # what is not varied stays as it was configured
+    variant = varied.varied.agents[int(drawn.variant)]
+    variant = dataclasses.replace(variant, hparams=drawn.hparams)
+    alone = jax.jit(sejax.make_evaluator(variant, task.env, task, training))
+    assert_close(train(key, task.params), alone(key, task.params), rtol=1e-4, atol=1e-5)
