@@ -119,20 +119,6 @@ def test_what_is_imported_is_the_wheel(run, python):
     assert Path(place).is_relative_to(python.parents[1]) and version == sejax.__version__
 
 
-def test_every_shipped_proxy_loads_or_says_what_to_install(run):
-    program = """\
-import sejax
-for proxy in sejax.pretrained():
-    try:
-        env, params = sejax.load(proxy.name)
-        print(proxy.name, env.task.name == proxy.task)
-    except sejax.ConfigError as error:
-        print(proxy.name, "sejax[mujoco]" in str(error))
-"""
-    lines = dict(line.split() for line in run("-c", program).splitlines())
-    assert lines == {proxy.name: "True" for proxy in sejax.pretrained()}
-
-
 def test_the_commands_run(run):
     tiny = ["env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "generations=1",
             "es.num_incumbent_evals=1", "training.max_steps=30", "devices=1",
@@ -161,15 +147,3 @@ def test_a_users_script_runs_and_mypy_finds_nothing_in_it(run, python, tmp_path)
     mypy = [sys.executable, "-m", "mypy", "--strict", "--python-executable", python,
             "--cache-dir", tmp_path / "cache", "script.py"]  # fmt: skip
     printed(*mypy, cwd=tmp_path)
-
-
-# --- with the extra search -----------------------------------------------------------------------
-
-
-def test_a_search_runs(run, python):
-    install(python, f"{one('*.whl')}[search]")
-    words = ["env=gridworld_2x2", "es.noise_std=interval(0.1, 1)", "es.population_size=2",
-             "trials=2", "min_generations=1", "max_generations=1", "verify=1", "fresh_seeds=1",
-             "devices=1", "search_dir=found"]  # fmt: skip
-    best = "python -m sejax.run env=gridworld_2x2 es.population_size=2 devices=1 es.noise_std="
-    assert best in run("-m", "sejax.search", *words)

@@ -95,40 +95,22 @@ def test_a_bandits_best_action_is_found(name, kind):
 
 # --- learning curves -----------------------------------------------------------------------------
 
-SOLVED = TrainingConfig(max_episodes=1000, stop_rule="solved", solved_by="train", max_steps=50_000)
 CURVES = {  # task, agent, training, and the least mean test return
-    "td3_discrete": ("cartpole", sejax.DiscreteTD3Config(), SOLVED, 195),
     "td3": (
-        "pendulum",
-        sejax.TD3Config(warmup_episodes=5, batch_size=128, learning_rate=1e-3),
-        TrainingConfig(
-            max_episodes=100, max_steps=20_000, stop_rule="never", time_limit_is_terminal=False
-        ),
-        -250,
+        "pendulum", sejax.TD3Config(warmup_episodes=5, batch_size=128, learning_rate=1e-3),
+        TrainingConfig(max_steps=20_000, stop_rule="never", time_limit_is_terminal=False), -250,
     ),
-    "ppo_discrete": (
+    "td3_discrete": (
+        "cartpole", sejax.DiscreteTD3Config(),
+        TrainingConfig(max_steps=50_000, stop_rule="solved", solved_by="train"), 195,
+    ),
+    "ppo": (
         "cartpole",
-        sejax.PPOConfig.paper(
-            activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20, discount=0.98
-        ),
-        TrainingConfig(max_episodes=1000, stop_rule="never", max_steps=80_000),
-        195,
+        sejax.PPOConfig.paper(activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20,
+                              discount=0.98),
+        TrainingConfig(max_steps=80_000, stop_rule="never"), 195,
     ),
-    "ppo_continuous": (
-        "pendulum",
-        sejax.PPOConfig.paper(
-            activation="tanh",
-            learning_rate=2e-3,
-            update_episodes=10,
-            epochs=30,
-            discount=0.9,
-            init_action_std=1.0,
-            entropy_weight=0.0,
-        ),
-        TrainingConfig(max_episodes=700, stop_rule="never"),
-        -600,
-    ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.slow
