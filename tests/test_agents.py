@@ -177,9 +177,7 @@ def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
         return begun, [act(keys) for act in acts]
 
     begun, actions = begun_and_actions(agent, state)
-    expected, expected_actions = begun_and_actions(plain, state.agent_state)
-    assert_equal(begun.agent_state, expected)
-    assert_equal(actions, expected_actions)
+    assert_equal((begun.agent_state, actions), begun_and_actions(plain, state.agent_state))
 
 
 @pytest.mark.parametrize("name", agents.names())

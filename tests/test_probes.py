@@ -102,7 +102,8 @@ CURVES = {  # task, agent, training, and the least mean test return
     ),
     "td3_discrete": (
         "cartpole", sejax.DiscreteTD3Config(),
-        TrainingConfig(max_steps=50_000, stop_rule="solved", solved_by="train"), 195,
+        TrainingConfig(max_episodes=1000, max_steps=50_000, stop_rule="solved", solved_by="train"),
+        195,
     ),
     "ppo": (
         "cartpole",
