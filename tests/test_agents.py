@@ -269,9 +269,3 @@ class Fixed(AgentConfig):
 )
 def test_an_agent_that_cannot_work_is_refused(make, field):
     assert refused(make) == field
-
-
-def test_an_agent_may_fit_every_task():
-    assert Fixed().steps_before_learning(200, 200) == 0
-    for task in (CARTPOLE, ROOM, envs.make("pendulum")):
-        assert isinstance(make_agent(Fixed(), task), sejax.Agent)

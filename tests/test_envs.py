@@ -119,9 +119,6 @@ def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
     assert shorter.max_steps == shorter.params.max_steps_in_episode == 3
     longer = dataclasses.replace(shorter, max_steps=4)
     assert longer.max_steps == longer.params.max_steps_in_episode == 4
-    assert dataclasses.replace(task, env=envs.make("acrobot").env, params=None).obs_dim == 6
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        task.max_steps = 5
 
 
 OURS = {  # where Gymnasium has no threshold, or other rules

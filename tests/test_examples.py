@@ -7,10 +7,9 @@ import shutil
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from support import paper_training, printed, refused
+from support import printed, refused
 
 import sejax
 from sejax.proxies import header
@@ -127,17 +126,3 @@ def test_algorithm_1_learns_an_se_whose_agents_solve_cartpole(tmp_path):
     said = printed(sys.executable, EXAMPLES / "algorithm1.py", cwd=tmp_path, env=compiled_in_full)
     returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
     assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 170
-
-
-# --- own_task, own_objective, own_agent ----------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_sac_learns_pendulum(examples):
-    own_agent = examples("own_agent")
-    task = sejax.envs.make("pendulum")
-    agent = sejax.make_agent(own_agent.SAC(), task)
-    training = paper_training(stop_rule="never", max_steps=15_000)
-    keys = jax.random.split(jax.random.key(7), 6)
-    outcome = sejax.evaluate_agents(agent, task.env, task.params, task, training, keys)
-    assert (outcome.test_return > -300).sum() >= 4

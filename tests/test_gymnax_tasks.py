@@ -113,28 +113,42 @@ def test_one_that_another_package_registers_is_a_task():
 # --- spaces that gymnax allows -------------------------------------------------------------------
 
 
-class Odd(gymnax.environments.environment.Environment):
-    """An environment of any spaces; the observation is what the action came to."""
+class Plain:
+    """An environment that has all that sejax uses, and is not derived from gymnax's."""
 
-    def __init__(self, action, obs):
-        self.action, self.obs = action, obs
+    default_params = gymnax.EnvParams(max_steps_in_episode=3)
+    is_truncated = gymnax.environments.environment.Environment.is_truncated
+    actions, observations = spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))
+    obs, reward, terminated = np.zeros(2), 0.0, np.bool_(False)
 
     def reset_env(self, key, params):
-        return jnp.zeros(self.obs.shape), gymnax.EnvState(time=0)
+        return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
 
     def step_env(self, key, state, action, params):
-        return jnp.resize(jnp.float32(action), self.obs.shape), state, 0.0, jnp.bool_(False), {}
+        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
 
     def action_space(self, params):
-        return self.action
+        return self.actions
 
     def observation_space(self, params):
-        return self.obs
+        return self.observations
 
 
-def odd_task(action, obs=None):
-    obs = spaces.Box(-1.0, 1.0, (2,)) if obs is None else obs
-    return Task(name="odd", env=Odd(action, obs), params=gymnax.EnvParams(max_steps_in_episode=3))
+def changed(**attributes):
+    """The plain environment but for these attributes."""
+    return type("Changed", (Plain,), attributes)()
+
+
+def echo(self, key, state, action, params):
+    """The observation is what the action came to."""
+    obs = jnp.resize(jnp.float32(action), self.obs.shape)
+    return obs, state, 0.0, jnp.bool_(False), {}
+
+
+def odd_task(actions, observations=Plain.observations):
+    obs = np.zeros(getattr(observations, "shape", 2))
+    env = changed(actions=actions, observations=observations, obs=obs, step_env=echo)
+    return Task(name="odd", env=env)
 
 
 def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
@@ -156,63 +170,39 @@ def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
 
 
 @pytest.mark.parametrize(
-    ("action", "obs", "is_wrapped"),
+    ("is_wrapped", "spaces_of_env"),
     [
-        (spaces.Discrete(2), None, False),
-        (spaces.Box(-2.0, 2.0, (1,)), None, False),
-        (spaces.Box(-2.0, 2.0, ()), None, True),
-        (spaces.Box(-2.0, 1.0, (1,)), None, True),
-        (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)), None, True),
-        (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)), True),
+        (False, (spaces.Discrete(2),)),
+        (False, (spaces.Box(-2.0, 2.0, (1,)),)),
+        (True, (spaces.Box(-2.0, 2.0, ()),)),
+        (True, (spaces.Box(-2.0, 1.0, (1,)),)),
+        (True, (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)),)),
+        (True, (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)))),
     ],
 )
-def test_environments_that_agents_can_take_as_they_are_are_left_alone(action, obs, is_wrapped):
-    assert isinstance(odd_task(action, obs).env, AsVectors) == is_wrapped
+def test_environments_that_agents_can_take_as_they_are_are_left_alone(is_wrapped, spaces_of_env):
+    assert isinstance(odd_task(*spaces_of_env).env, AsVectors) == is_wrapped
 
 
 DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])
 
 
 @pytest.mark.parametrize(
-    ("action", "obs"),
+    "spaces_of_env",
     [
-        (DICT, None),
-        (TUPLE, None),
+        (DICT,),
+        (TUPLE,),
         (spaces.Discrete(2), DICT),
-        (spaces.Box(-jnp.inf, 1.0, (1,)), None),
-        (spaces.Box(-1.0, jnp.inf, (1,)), None),
-        (spaces.Box(1.0, 1.0, (1,)), None),
+        (spaces.Box(-jnp.inf, 1.0, (1,)),),
+        (spaces.Box(-1.0, jnp.inf, (1,)),),
+        (spaces.Box(1.0, 1.0, (1,)),),
     ],
 )
-def test_spaces_that_no_agent_could_use_are_refused(action, obs):
-    assert refused(odd_task, action, obs) == "env"
+def test_spaces_that_no_agent_could_use_are_refused(spaces_of_env):
+    assert refused(odd_task, *spaces_of_env) == "env"
 
 
 # --- environments with a fault -------------------------------------------------------------------
-
-
-class Plain:
-    """An environment that has all that sejax uses, and is not derived from gymnax's."""
-
-    default_params = gymnax.EnvParams(max_steps_in_episode=3)
-    is_truncated = Odd.is_truncated
-    obs, reward, terminated = np.zeros(2), 0.0, np.bool_(False)
-
-    def reset_env(self, key, params):
-        return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
-
-    def step_env(self, key, state, action, params):
-        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
-
-    def action_space(self, params):
-        return spaces.Discrete(2)
-
-    def observation_space(self, params):
-        return spaces.Box(-1.0, 1.0, (2,))
-
-
-def with_fault(**attributes):
-    return type("Faulty", (Plain,), attributes)()
 
 
 def drifts(self, key, state, action, params):
@@ -226,13 +216,13 @@ class Limit(NamedTuple):
 @pytest.mark.parametrize(
     ("env", "options", "field"),
     [
-        (with_fault(is_truncated=None), {}, "env"),
-        (with_fault(action_space=lambda self, params: {}["actions"]), {}, "env"),
-        (with_fault(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
-        (with_fault(obs=np.zeros(3)), {}, "env"),
-        (with_fault(step_env=drifts), {}, "env"),
-        (with_fault(terminated=np.float32(0)), {}, "env"),
-        (with_fault(reward=np.zeros(2)), {}, "env"),
+        (changed(is_truncated=None), {}, "env"),
+        (changed(action_space=lambda self, params: {}["actions"]), {}, "env"),
+        (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
+        (changed(obs=np.zeros(3)), {}, "env"),
+        (changed(step_env=drifts), {}, "env"),
+        (changed(terminated=np.float32(0)), {}, "env"),
+        (changed(reward=np.zeros(2)), {}, "env"),
         (gymnax.make("CartPole-v1"), {}, "env"),  # a pair
         (Plain(), {"params": Limit(), "max_steps": 5}, "env"),
         (Plain(), {"params": gymnax.EnvState(time=0)}, "env"),
@@ -258,7 +248,7 @@ def reads(self, key, state, action, params):
 
 @pytest.mark.parametrize("step_env", [branches, reads])
 def test_a_fault_in_code_of_ones_own_is_told_with_its_place(step_env):
-    error = refusal(Task, name="mine", env=with_fault(step_env=step_env))
+    error = refusal(Task, name="mine", env=changed(step_env=step_env))
     said, line = str(error), step_env.__code__.co_firstlineno + 1
     source = Path(__file__).read_text().splitlines()[line - 1].strip()
     assert error.field == "env" and "use jnp.where" in said

@@ -10,11 +10,8 @@ import pytest
 from flax import struct
 from support import assert_equal, random_columns, shapes_of, unraveled
 
-from sejax import envs
-from sejax.agents import make_agent
 from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
-from sejax.agents.dqn import DDQNConfig
 from sejax.agents.exploration import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
@@ -192,13 +189,3 @@ def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kin
     assert after.agent_state.updates == 1
     changed = (np.asarray(after.agent_state.rows) != rollout.rows).any(axis=0)
     assert list(np.flatnonzero(changed)) == [rollout.rows.shape[1] - 3]  # the rewards alone
-
-
-# --- the rest of the agent -----------------------------------------------------------------------
-
-
-def test_a_curious_agent_trains_alone_on_a_core():
-    # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
-    task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
-    assert make_agent(small, task).spec.cpu_num_parallel > 1
-    assert make_agent(small, task, ICMConfig()).spec.cpu_num_parallel == 1

@@ -243,14 +243,6 @@ def test_a_simulation_that_explodes_begins_anew_and_leaves_no_log(monkeypatch, t
     assert not list(tmp_path.iterdir()) and capfd.readouterr() == ("", "")
 
 
-def test_where_jax_has_doubles_a_task_is_the_same():
-    task, key = envs.make("reacher"), jax.random.key(0)
-    with jax.enable_x64(True):
-        obs, state = task.env.reset_env(key, task.params)
-        obs, *_ = task.env.step_env(None, state, np.ones(2), task.params)
-    assert np.isfinite(obs).all() and task.env.num_actions == 2
-
-
 # --- what cannot be ------------------------------------------------------------------------------
 
 

@@ -17,21 +17,15 @@ from support import (
     drawing,
     numpy_forward,
     raveled,
+    refused,
     shapes_of,
     unraveled,
 )
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.ppo import (
-    MIN_STD,
-    PPO,
-    ContinuousPPO,
-    PPOConfig,
-    shuffled,
-)
+from sejax.agents.ppo import MIN_STD, PPO, ContinuousPPO, PPOConfig, shuffled
 from sejax.ops.networks import MLP
-from sejax.options import ConfigError
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -244,9 +238,8 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
 
 
 def test_a_minibatch_has_at_least_two_steps():
-    with pytest.raises(ConfigError) as error:
-        ppo("gae", dataclasses.replace(GAE, num_minibatches=7))
-    assert error.value.field == "agent.num_minibatches"
+    config = dataclasses.replace(GAE, num_minibatches=7)
+    assert refused(ppo, "gae", config) == "agent.num_minibatches"
 
 
 # --- policies ------------------------------------------------------------------------------------

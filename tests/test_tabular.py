@@ -43,13 +43,6 @@ def started(agent, q_values=None, epsilon=None):
     return state if epsilon is None else state.replace(epsilon=np.float32(epsilon))
 
 
-def step(obs, action, reward, discount=0.0, next_obs=0):
-    return Transition(
-        obs=np.int32(obs), action=np.int32(action), reward=np.float32(reward),
-        discount=np.float32(discount), next_obs=np.int32(next_obs),
-    )  # fmt: skip
-
-
 def random_steps(num_steps, num_states=NUM_STATES, num_actions=NUM_ACTIONS, seed=0):
     """Leaves `[num_steps]`: discounts are 0, 1 and, in a third of the steps, a soft done's."""
     rng = np.random.default_rng(seed)
