@@ -117,16 +117,6 @@ def random_columns(rng, obs_dim, batch_size):
     return {name: np.float32(x) for name, x in arrays.items()}
 
 
-def train_on(agent, batch, num_updates):
-    """The agent after so many updates on a batch; to be called in a jitted function."""
-
-    def step(state, key):
-        return agent.update(key, state, batch), None
-
-    state = agent.init(jax.random.key(0), agent.hparams)
-    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
-
-
 @functools.cache
 def drawing(agent):
     """The actions of 4000 keys, `(state, obs) -> (exploring, testing)`, jitted."""

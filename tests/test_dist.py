@@ -31,15 +31,13 @@ import sejax.gym
 
 proxy = sejax.load_proxy("cartpole")
 agent = sejax.make_agent(sejax.DDQNConfig(warmup_episodes=1, hidden_size=4), proxy.task)
-train = sejax.make_trainer(
-    agent, proxy.env, sejax.TrainingConfig(max_steps=20, stop_rule="never")
-)
+training = sejax.TrainingConfig(max_steps=20, stop_rule="never")
+train = sejax.make_trainer(agent, proxy.env, training)
 trained: sejax.TrainResult = jax.jit(train)(jax.random.key(0), proxy.params)
-evaluate = sejax.make_evaluator(agent, proxy.env, proxy.task, sejax.TrainingConfig())
 learn = sejax.make_learner(sejax.config(["env=gridworld_2x2", "agent=q_learning"]))
 shapes: sejax.LearnResult = jax.eval_shape(learn, jax.random.key(0))
 env = sejax.gym.make("cartpole")
-obs, info = env.reset(seed=0)
+env.reset(seed=0)
 obs, reward, terminated, truncated, info = env.step(1)
 print(int(trained.train_steps), shapes.score.shape, float(reward) < 1e9, len(sejax.pretrained()))
 """

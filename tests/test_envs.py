@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.environments import spaces
-from support import refused
+from support import assert_close, assert_equal, refused
 
 from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2, GridParams, GridWorld
@@ -106,8 +106,8 @@ def test_steps_return_what_the_inner_loop_relies_on(name):
     if task.num_states is None:
         assert len(np.unique(obs, axis=0)) == num and np.isfinite(next_obs).all()
     alone = jax.jit(step)(keys[1], actions[1], times[1])[2]
-    for x, y in zip(alone[:4], (next_obs, next_state, reward, terminated), strict=True):
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y[1], rtol=1e-5, atol=1e-5), x, y)
+    batched = jax.tree.map(lambda x: x[1], (next_obs, next_state, reward, terminated))
+    assert_close(alone[:4], batched, rtol=1e-5, atol=1e-5)
 
 
 def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
@@ -209,9 +209,9 @@ def test_a_loop_of_gymnax_sees_what_it_sees_with_gymnaxs_own():
 
     theirs, theirs_params = gymnax.make("CartPole-v1")
     theirs_params = theirs_params.replace(max_steps_in_episode=12)
-    mine = walk(envs.make("cartpole").env, params)
-    assert mine[3].sum() > 2  # truncated, and reset
-    jax.tree.map(np.testing.assert_array_equal, mine, walk(theirs, theirs_params))
+    ours = walk(envs.make("cartpole").env, params)
+    assert ours[3].sum() > 2  # truncated, and reset
+    assert_equal(ours, walk(theirs, theirs_params))
 
 
 # --- grid worlds ---------------------------------------------------------------------------------

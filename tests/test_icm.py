@@ -81,22 +81,10 @@ def model_of(config):
     return model, lambda flat: unraveled(flat, variables)
 
 
-@pytest.fixture(scope="module")
-def updates():
-    """Jitted updates of the wrapped stub by kind, `(key, state, batch, number=1) -> state`."""
-
-    def updates_of(kind):
-        agent = curious(kind)
-
-        @jax.jit
-        def update(key, state, batch, number=1):
-            return jax.lax.fori_loop(
-                0, number, lambda _, state: agent.update(key, state, batch), state
-            )
-
-        return update
-
-    return {kind: updates_of(kind) for kind in KINDS}
+@functools.cache
+def update_of(kind):
+    """The wrapped stub's jitted update."""
+    return jax.jit(curious(kind).update)
 
 
 @functools.cache
@@ -130,12 +118,12 @@ def test_large_logits_make_a_large_and_finite_loss():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
+def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind):
     golden = np.load(GOLDEN)  # made by torch_icm.py
     state = fresh(kind)
     for number in range(1, 6):
         batch = random_batch(number, kind)
-        state = updates[kind](KEY, state, batch)
+        state = update_of(kind)(KEY, state, batch)
         if number in (1, 5):
             expected = golden[f"{kind}/params/{number}"]
             np.testing.assert_allclose(state.params, expected, rtol=1e-5, atol=2e-6)
@@ -148,17 +136,17 @@ def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
 # --- what the agent sees -------------------------------------------------------------------------
 
 
-def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
+def test_indices_and_their_one_hot_vectors_have_the_same_bonus():
     # Discrete TD3 keeps vectors: they go to the forward model as they are.
     batch = random_batch(4, "index")
     state = fresh("index", learning_rate=0.0)
     one_hot = batch._replace(action=np.eye(WIDTH, dtype=np.float32)[:, batch.action])
-    expected = bonus(updates["index"](KEY, state, batch), batch)
+    expected = bonus(update_of("index")(KEY, state, batch), batch)
     keeping = state.replace(agent_state=state.agent_state.replace(batch=one_hot))
-    got = bonus(updates["index"](KEY, keeping, one_hot), batch)
+    got = bonus(update_of("index")(KEY, keeping, one_hot), batch)
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
     flipped = batch._replace(action=1 - batch.action)
-    assert np.abs(bonus(updates["index"](KEY, state, flipped), batch) - expected).max() > 1e-4
+    assert np.abs(bonus(update_of("index")(KEY, state, flipped), batch) - expected).max() > 1e-4
 
 
 # --- rollouts ------------------------------------------------------------------------------------
@@ -175,14 +163,14 @@ def as_rollout(batch, is_full=True):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind, updates):
+def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind):
     batch, state = random_batch(1, kind), fresh(kind)
     rollout = as_rollout(batch)
-    before = updates[kind](
+    before = update_of(kind)(
         KEY, fresh(kind, learning_rate=0), batch
     )  # the bonus by the models as they were
-    trained = updates[kind](KEY, state, batch)
-    after = updates[kind](KEY, state, rollout)
+    trained = update_of(kind)(KEY, state, batch)
+    after = update_of(kind)(KEY, state, rollout)
     np.testing.assert_allclose(bonus(after, batch), bonus(before, batch), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(after.params, trained.params, rtol=1e-5, atol=1e-6)
     assert np.abs(bonus(trained, batch) - bonus(before, batch)).max() > 1e-4

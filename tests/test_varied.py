@@ -23,6 +23,7 @@ from sejax.ops.networks import MLP, narrow
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
+KEY = jax.random.key(0)
 NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than one block
 
 
@@ -194,28 +195,20 @@ def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
 # --- varied agents -------------------------------------------------------------------------------
 
 
-def test_every_drawn_agent_finds_a_network_with_room():
-    task = envs.make("cartpole")
+def test_every_drawn_agent_finds_the_smallest_network_with_room():
     config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
-    varied = make_agent(config, task, varied=True)
-    draws = jax.jit(jax.vmap(varied.varied.draw))(jax.random.split(jax.random.key(0), 200))
-    values = {name: np.asarray(x) for name, x in draws.values.items()}
+    varied = make_agent(config, envs.make("cartpole"), varied=True).varied
+    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
     bounds = ranges_of(config)
-    assert set(values) == set(bounds)
+    assert set(draws.values) == set(bounds)
     sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
-    assert len(varied.varied.agents) == sum(map(len, sizes.values()))
-
-    @functools.cache
-    def num_params(index):
-        agent = varied.varied.agents[index]
-        return jax.eval_shape(agent.init, jax.random.key(0), agent.hparams).params.shape[0]
-
-    for index, hidden, depth in zip(draws.variant.tolist(), values["hidden_size"],
-                                    values["num_layers"], strict=True):  # fmt: skip
-        room = min(size for size in sizes[int(depth)] if size >= hidden)
-        inner = (int(depth) - 1) * room * (room + 1)
-        assert num_params(index) == room * 5 + inner + 2 * (room + 1)
-    assert len(set(draws.variant.tolist())) == len(varied.varied.agents)
+    shapes = [jax.eval_shape(x.init, KEY, x.hparams).params.shape for x in varied.agents]
+    hidden, depths = draws.values["hidden_size"].tolist(), draws.values["num_layers"].tolist()
+    for variant, width, depth in zip(draws.variant.tolist(), hidden, depths, strict=True):
+        size = min(size for size in sizes[int(depth)] if size >= width)
+        inner = (int(depth) - 1) * size * (size + 1)
+        assert shapes[variant] == (size * 5 + inner + 2 * (size + 1),)
+    assert len(set(draws.variant.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
 
 
 def test_the_agent_inside_an_exploring_one_is_varied():
