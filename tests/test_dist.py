@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tarfile
 import zipfile
 from pathlib import Path
 
@@ -98,15 +97,6 @@ def test_the_wheel_is_the_package_as_git_has_it(wheel):
     assert all((ROOT / name).read_bytes() == x for name, x in package.items())
     assert {"sejax/envs/mujoco/step.cc", "sejax/presets/cartpole-se.yaml", "sejax/py.typed",
             "sejax/pretrained/cartpole.safetensors"} < set(package)  # fmt: skip
-
-
-def test_the_sdist_holds_the_package_and_what_builds_it_alone():
-    with tarfile.open(one("*.tar.gz")) as sdist:
-        names = {member.name.partition("/")[2] for member in sdist if member.isfile()}
-    made = {name for name in names if ".egg-info/" in name} | {"PKG-INFO", "setup.cfg"}
-    beside = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "SECURITY.md",
-              "pyproject.toml"}  # fmt: skip
-    assert names - made == of_git("sejax") | beside
 
 
 # --- what they do, bare --------------------------------------------------------------------------

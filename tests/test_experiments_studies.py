@@ -15,31 +15,20 @@ from sejax.bilevel import make_bilevel
 # --- score transforms -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("solved_at", "updates", "advanced"), [
-    ([3, 0, 9, 1, 4], [3, 0, 5, 1, 4], 5), ([1, 0], [1, 0], 2),
-])  # fmt: skip
-def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
-    solved_at, updates, advanced, monkeypatch
-):
+def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(monkeypatch):
     """Runs that solve the task at a known generation, in place of compiled ones."""
-    made, none = [], np.zeros(len(updates), int)
-
-    def init(keys, sizes):
-        np.testing.assert_allclose(sizes, score_transforms.draw_step_sizes(len(keys), 3), rtol=1e-6)
-        return SimpleNamespace(generation=none, solved=none > 0, incumbent_score=none)
 
     def advance(state):
         generation = np.where(state.solved, state.generation, state.generation + 1)
-        solved, score = generation > np.asarray(solved_at), 100 * np.arange(len(none))
-        made.append(SimpleNamespace(generation=generation, solved=solved, incumbent_score=score))
-        return made[-1]
+        solved = generation > np.array([3, 0, 9, 1, 4])
+        return SimpleNamespace(generation=generation, solved=solved, incumbent_score=generation)
 
-    monkeypatch.setattr(score_transforms, "make_search", lambda *_: (init, advance))
-    asked = score_transforms.ScoreTransforms.of(runs=len(updates), generations=5, seed=3)
-    cell = score_transforms.compute_cell(asked, "nes", True)
-    assert list(cell["updates"]) == updates and list(cell["solved"]) == [x < 5 for x in updates]
-    assert list(cell["last_score"]) == [100 * run for run in range(len(updates))]
-    assert len(made) == advanced, "nothing is computed when all runs are over"
+    start = SimpleNamespace(generation=np.zeros(5, int), solved=np.zeros(5, bool))
+    monkeypatch.setattr(score_transforms, "make_search", lambda *_: (lambda *_: start, advance))
+    settings = score_transforms.ScoreTransforms.of(runs=5, generations=5, seed=3)
+    cell = score_transforms.compute_cell(settings, "nes", True)
+    assert list(cell["updates"]) == [3, 0, 5, 1, 4]
+    assert list(cell["solved"]) == [True, True, False, True, True]
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, from_evosax
 from sejax.es.nes import NESConfig
-from sejax.options import registry
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
@@ -175,14 +174,6 @@ def evosax_strategy(name):
     return EvosaxConfig(name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1).make(
         DIMS
     )
-
-
-def test_the_names_are_those_of_evosaxs_classes_and_of_the_registry():
-    from evosax.algorithms import distribution_based_algorithms
-
-    classes = {algorithm.cls for algorithm in ALGORITHMS.values()}
-    assert classes <= set(distribution_based_algorithms)
-    assert registry.names("es") == ["nes", *ALGORITHMS]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
