@@ -153,38 +153,23 @@ def large_ops_in_loops(hlo, num_elements):
     least `num_elements` elements and that is not one of `IN_PLACE`. What runs once before a loop
     is not listed.
     """
-    computations, name = {}, None
-    for line in hlo.splitlines():
-        header = re.match(r"(?:ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$", line)
-        if header:
-            name = header.group(1)
-            computations[name] = []
-        elif line.startswith("}"):
-            name = None
-        elif name:
-            computations[name].append(line.strip())
-    pending = {body for body in re.findall(r"body=%?([\w.\-]+)", hlo)}
+    blocks = re.findall(
+        r"^(?:ENTRY )?%?([\w.\-]+) \([^\n]*\) -> [^\n]*\{\n(.*?)^\}", hlo, re.MULTILINE | re.DOTALL
+    )
+    computations = dict(blocks)
+    pending, reached = set(re.findall(r"body=%?([\w.\-]+)", hlo)), set()
     assert pending, "the program has no loop"
-    reached = set()
     while pending:
         name = pending.pop()
         reached.add(name)
-        called = re.findall(
-            r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.\-]+)",
-            "\n".join(computations[name]),
-        )
-        for branches in re.findall(
-            r"(?:branch_computations|called_computations)=\{(.*?)\}", "\n".join(computations[name])
-        ):
-            called += re.findall(r"%?([\w.\-]+)", branches)
-        pending |= set(called) - reached
-    found = []
-    for name in sorted(reached):
-        for line in computations[name]:
-            op = re.search(r"= \w+\[([\d,]*)\]\S* ([\w\-]+)\(", line)  # results that are no tuple
-            if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
-                found.append((op.group(2), line))
-    return [(op, line) for op, line in found if op not in IN_PLACE]
+        mentioned = set(re.findall(r"[\w.\-]+", computations[name]))
+        pending |= (mentioned & set(computations)) - reached
+    large = []
+    for line in "".join(computations[name] for name in sorted(reached)).splitlines():
+        op = re.search(r"= \w+\[([\d,]*)\]\S* ([\w\-]+)\(", line)  # results that are no tuple
+        if op and math.prod(int(d) for d in op[1].split(",") if d) >= num_elements:
+            large.append((op[2], line.strip()))
+    return [(op, line) for op, line in large if op not in IN_PLACE]
 
 
 def metrics(folder):

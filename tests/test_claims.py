@@ -21,35 +21,27 @@ steps, [paper](https://arxiv.org/abs/2202.02790), `seed=3`, over 16 workers (Fer
 
 <!-- end -->
 """
-ENTRIES = {
-    "documents": ["README.md"],
-    "claims": {
-        "share": {
-            "text": "DDQN takes {share:.0%} of the steps",
-            "rows": "results/rows.csv",
-            "values": {
-                "share": "rows.steps.iloc[0] / rows.steps.iloc[1]",
-                "agents": "rows.agents.max()",
-            },
-            "count": "{agents} agents",
-        }
-    },
-    "tables": {
-        "steps": {
-            "head": "agent | steps",
-            "lines": [
-                {
-                    "cells": "{kind} | {steps:,} [{low:.0f}, {high:.0f}]",
-                    "rows": "results/rows.csv",
-                    "where": "kind == 'ddqn'",
-                }
-            ],
-        }
-    },
-    "stated": {"over 16 workers": "paper, Table 3", "of 2026 tests": "the test"},
-}
-
-
+ENTRIES = yaml.safe_load("""
+documents: [README.md]
+claims:
+  share:
+    text: "DDQN takes {share:.0%} of the steps"
+    rows: results/rows.csv
+    values:
+      share: rows.steps.iloc[0] / rows.steps.iloc[1]
+      agents: rows.agents.max()
+    count: "{agents} agents"
+tables:
+  steps:
+    head: agent | steps
+    lines:
+      - cells: "{kind} | {steps:,} [{low:.0f}, {high:.0f}]"
+        rows: results/rows.csv
+        where: kind == 'ddqn'
+stated:
+  over 16 workers: paper, Table 3
+  of 2026 tests: the test
+""")
 TYPED = {"share": ENTRIES["claims"]["share"] | {"text": "DDQN takes 41% of the steps"}}
 
 

@@ -184,8 +184,8 @@ def test_the_std_stops_at_its_floor_and_can_grow_again():
     _, _, unravel = networks("continuous")
 
     def learn(state, entropy_weight):
-        hparams = state.hparams.replace(entropy_weight=np.float32(entropy_weight),
-                                         learning_rate=np.float32(0.05))  # fmt: skip
+        numbers = {"entropy_weight": entropy_weight, "learning_rate": 0.05}
+        hparams = state.hparams.replace(**jax.tree.map(np.float32, numbers))
         return update_of(agent)(KEY, state.replace(hparams=hparams), rollout("continuous"))
 
     state = state_of(agent)

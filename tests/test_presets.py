@@ -86,13 +86,6 @@ def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
 # --- the files -----------------------------------------------------------------------------------
 
 
-def test_what_is_tuned_is_known():
-    assert preset_files.names() == ["best", "distilled", "paper", "paper_performance", "soft"]
-    assert preset_files.tuned("rn") == sorted([*RN_TASKS, "pendulum"])
-    assert preset_files.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert preset_files.is_tuned("acrobot", "se") and not preset_files.is_tuned("acrobot", "rn")
-
-
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
     for path in preset_files.PRESETS.glob("*-*.yaml"):
         env, _, proxy = path.stem.rpartition("-")

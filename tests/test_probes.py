@@ -67,17 +67,15 @@ AGENTS = {
 }
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize(
+    ("name", "kind"), [(name, kind) for name, config in AGENTS.items() for kind in config.actions]
+)
 def test_a_bandits_best_action_is_found(name, kind):
     config = AGENTS[name]
-    if kind not in config.actions:
-        pytest.skip("an agent for other actions")
     task = sejax.Task(name="bandit", env=Bandit(kind == "discrete"))
     agent = sejax.make_agent(config, task)
-    train = sejax.make_trainer(
-        agent, task.env, TrainingConfig(max_episodes=2000, stop_rule="never")
-    )
+    training = TrainingConfig(max_episodes=2000, stop_rule="never")
+    train = sejax.make_trainer(agent, task.env, training)
 
     @jax.jit
     def actions_in(contexts):
