@@ -80,13 +80,8 @@ def script(returns, lengths, **fields):
 
 
 def scripted_agent(warmup_episodes=2, batch_size=64):
-    empty = Transition(
-        obs=jnp.zeros((2, batch_size)),
-        action=jnp.zeros(batch_size, jnp.int32),
-        reward=jnp.zeros(batch_size),
-        discount=jnp.zeros(batch_size),
-        next_obs=jnp.zeros((2, batch_size)),
-    )
+    obs, numbers = jnp.zeros((2, batch_size)), jnp.zeros(batch_size)
+    empty = Transition(obs, jnp.int32(numbers), numbers, numbers, obs)
 
     def init(key, hparams):
         return ScriptedAgentState(
@@ -95,11 +90,9 @@ def scripted_agent(warmup_episodes=2, batch_size=64):
         )  # fmt: skip
 
     def update(key, state, batch):
-        return state.replace(
-            num_updates=state.num_updates + 1,
-            batch=batch,
-            min_discount=jnp.minimum(state.min_discount, batch.discount.min()),
-        )
+        discount = jnp.minimum(state.min_discount, batch.discount.min())
+        num_updates = state.num_updates + 1
+        return state.replace(num_updates=num_updates, batch=batch, min_discount=discount)
 
     return Agent(
         init=init,
