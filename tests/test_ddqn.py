@@ -45,21 +45,6 @@ def random_batch(seed):
     return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
 
 
-@pytest.fixture(scope="module")
-def agent():
-    return DDQN(CONFIG, OBS_DIM, NUM_ACTIONS).agent()
-
-
-@pytest.fixture(scope="module")
-def state(agent):
-    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-
-
-@pytest.fixture(scope="module")
-def update(agent):
-    return jax.jit(agent.update)
-
-
 def state_with(agent, params, target_params):
     """A fresh state with these parameters; nothing is compiled."""
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)

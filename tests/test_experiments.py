@@ -235,7 +235,6 @@ def test_words_that_cannot_work_are_refused(word, field):
     ("rn_performance", {"rows": "tuned"}, "rows"),  # there is none on Cliff Walking
     ("rn_performance", {"bonuses": "icm"}, "bonuses"),
     ("rn_performance", {"rns": 3, "learned": 2}, "rns"),
-    ("rn_objectives", {"picks": "top"}, "picks"),
     ("timings", {"rows": "pendulum-rn"}, "rows"),
 ])  # fmt: skip
 def test_settings_that_cannot_work_are_refused_at_once(name, options, field):

@@ -97,7 +97,6 @@ WEIGHTED = "proxy.variant=exclusive_weighted_info"
         ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
         ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
         ([ENV, RN, "agent=ddqn"], "agent"),
-        (["env=pendulum", RN, "preset=paper"], "preset"),
         (["env=hopper", "env.reset_noise_scale=-1"], "env.reset_noise_scale"),
         (["env=ant", "env.ctrl_cost_weight=1e31"], "env.ctrl_cost_weight"),
     ],

@@ -87,20 +87,12 @@ def update_of(kind):
     return jax.jit(curious(kind).update)
 
 
-@functools.cache
-def initial(kind):
-    """A fresh state with the parameters that torch started from; nothing is compiled."""
+def fresh(kind, **hparams):
+    """A wrapped stub with the parameters that torch started from; nothing is compiled."""
     agent = curious(kind)
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
-    hparams = jax.tree.map(np.float32, agent.hparams.replace(agent=None))
+    hparams = jax.tree.map(np.float32, agent.hparams.replace(agent=None, **hparams))
     return state.replace(params=np.load(GOLDEN)[f"{kind}/params/0"], hparams=hparams)
-
-
-def fresh(kind, **hparams):
-    """A wrapped stub with these hyperparameters."""
-    state = initial(kind)
-    numbers = {name: np.float32(x) for name, x in hparams.items()}
-    return state.replace(hparams=state.hparams.replace(**numbers))
 
 
 def bonus(state, batch):

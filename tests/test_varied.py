@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import assert_close, random_columns
+from support import assert_close, random_columns, shapes_of
 
 import sejax
 from sejax import envs
@@ -75,12 +75,6 @@ def configured(kind, hidden_size, batch_size):
     )  # fmt: skip
 
 
-def zeros_of(init):
-    """Parameters of the right shapes, without drawing any."""
-    shapes = jax.eval_shape(init, jax.random.key(0), jnp.zeros(OBS_DIM))
-    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-
-
 def embed(small, large):
     """The small network's parameters in a large one's, whose other entries are 0."""
 
@@ -100,7 +94,9 @@ def random_batch(num_columns, seed):
 def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(kind):
     configs = [configured(kind, SMALL, NUM_COLUMNS), configured(kind, LARGE, BATCH)]
     small, large = (DDQN(config, OBS_DIM, NUM_ACTIONS).agent() for config in configs)
-    templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
+    templates = [
+        shapes_of(config.network(NUM_ACTIONS).init, KEY, np.zeros(OBS_DIM)) for config in configs
+    ]
 
     @jax.jit
     def widened(params):
