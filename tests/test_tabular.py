@@ -43,6 +43,12 @@ def started(agent, q_values=None, epsilon=None):
     return state if epsilon is None else state.replace(epsilon=np.float32(epsilon))
 
 
+def step(obs, action, reward, discount=0.0, next_obs=0):
+    indices = (np.int32(x) for x in (obs, action, next_obs))
+    obs, action, next_obs = indices
+    return Transition(obs, action, np.float32(reward), np.float32(discount), next_obs)
+
+
 def random_steps(num_steps, num_states=NUM_STATES, num_actions=NUM_ACTIONS, seed=0):
     """Leaves `[num_steps]`: discounts are 0, 1 and, in a third of the steps, a soft done's."""
     rng = np.random.default_rng(seed)
