@@ -4,6 +4,7 @@ Observation, reward, `terminated` and `truncated`: `info` is not read. An episod
 terminated is worth nothing further, one that was merely cut is bootstrapped.
 """
 
+import copy
 import itertools
 
 import gymnasium
@@ -22,12 +23,6 @@ class Network:
             self.weights += [rng.uniform(-1, 1, shape) / num_in**0.5 for shape in shapes]
         self.weights = [w.astype(np.float32) for w in self.weights]
         self.moments = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]
-
-    def copy(self):
-        """A network of the same weights, to follow this one slowly."""
-        twin = object.__new__(Network)
-        twin.squash, twin.weights = self.squash, [w.copy() for w in self.weights]
-        return twin
 
     def follow(self, other, rate=0.01):
         for mine, its in zip(self.weights, other.weights, strict=True):
@@ -92,7 +87,7 @@ class DQN:
         self.num_actions, self.discount = int(env.action_space.n), discount
         rng = np.random.default_rng(seed)
         self.values = Network(rng, env.observation_space.shape[0], self.num_actions)
-        self.target = self.values.copy()
+        self.target = copy.deepcopy(self.values)
 
     def act(self, obs):
         return int(self.target(obs[None]).argmax())
@@ -118,8 +113,8 @@ class DDPG:
         num_obs, num_actions = env.observation_space.shape[0], len(self.low)
         self.policy = Network(rng, num_obs, num_actions, squash=True)
         self.critics = [Network(rng, num_obs + num_actions, 1) for _ in range(2)]
-        self.slow_policy = self.policy.copy()
-        self.slow_critics = [critic.copy() for critic in self.critics]
+        self.slow_policy = copy.deepcopy(self.policy)
+        self.slow_critics = copy.deepcopy(self.critics)
 
     def act(self, obs):
         return self.scaled(self.policy(obs[None])[0])
@@ -155,13 +150,12 @@ def agent_for(env, seed):
 
 def mean_return(agent, env, num_episodes, seed):
     """Mean return of greedy episodes."""
-    returns = []
+    total = 0.0
     for episode in range(num_episodes):
         obs, _ = env.reset(seed=seed + episode)
-        returns.append(0.0)
         ended = False
         while not ended:
             obs, reward, terminated, truncated, _ = env.step(agent.act(obs))
-            returns[-1] += float(reward)
+            total += float(reward)
             ended = terminated or truncated
-    return np.mean(returns)
+    return total / num_episodes

@@ -72,10 +72,8 @@ def script(returns, lengths, **fields):
 
 
 def scripted_agent(warmup_episodes=2, batch_size=64):
-    obs, number = jnp.zeros((2, batch_size)), jnp.zeros(batch_size)
-    empty = Transition(
-        obs=obs, action=number.astype(jnp.int32), reward=number, discount=number, next_obs=obs
-    )
+    obs, numbers = jnp.zeros((2, batch_size)), jnp.zeros(batch_size)
+    empty = Transition(obs, jnp.int32(numbers), numbers, numbers, obs)
 
     def init(key, hparams):
         return ScriptedAgentState(
@@ -84,8 +82,9 @@ def scripted_agent(warmup_episodes=2, batch_size=64):
         )  # fmt: skip
 
     def update(key, state, batch):
-        least = jnp.minimum(state.min_discount, batch.discount.min())
-        return state.replace(num_updates=state.num_updates + 1, batch=batch, min_discount=least)
+        discount = jnp.minimum(state.min_discount, batch.discount.min())
+        num_updates = state.num_updates + 1
+        return state.replace(num_updates=num_updates, batch=batch, min_discount=discount)
 
     return Agent(
         init=init,

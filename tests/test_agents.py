@@ -11,7 +11,7 @@ from support import assert_close, assert_equal, refused
 
 import sejax
 from sejax import agents, envs, make_agent, make_trainer
-from sejax.agents import AgentConfig, Rollout, Transition
+from sejax.agents import AgentConfig, Transition
 from sejax.options import registry, traced_options
 
 NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
@@ -163,22 +163,6 @@ def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alon
     assert moved(*alone)
 
 
-@every_agent
-def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
-    task, agent, _ = parts(case)
-    state, batch = started(case)
-    obs = jnp.int32(0) if task.num_states else jnp.zeros(task.obs_dim)
-    act = functools.partial(agent.act, explore=True)
-    action, scalar = jax.eval_shape(act, jax.random.key(0), state, obs), jnp.float32(0)
-    buffer = agent.buffer(Transition(obs, action, scalar, scalar, obs), NUM_STEPS)
-    assert_equal(buffer.mask(batch, True), batch)
-    masked = buffer.mask(batch, False)
-    if isinstance(batch, Rollout):
-        assert_equal(update_of(case)(jax.random.key(0), state, masked), state)
-    else:  # thrown away by the trainer, and no cheaper for being masked
-        assert_equal(masked, batch)
-
-
 @pytest.mark.parametrize("case", EXPLORING[::3], ids="-".join)
 def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
     task, agent, _ = parts(case)
@@ -193,9 +177,7 @@ def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
         return begun, [act(keys) for act in acts]
 
     begun, actions = begun_and_actions(agent, state)
-    expected, expected_actions = begun_and_actions(plain, state.agent_state)
-    assert_equal(begun.agent_state, expected)
-    assert_equal(actions, expected_actions)
+    assert_equal((begun.agent_state, actions), begun_and_actions(plain, state.agent_state))
 
 
 @pytest.mark.parametrize("name", agents.names())
@@ -222,16 +204,6 @@ def test_columns_of_no_weight_change_nothing(case):
     assert_close(update(key, state, batch), update(key, state, other), rtol=1e-5, atol=1e-7)
     all_count = batch._replace(weight=jnp.ones_like(batch.weight))
     assert moved(update(key, state, batch), update(key, state, all_count))
-
-
-@pytest.mark.parametrize(
-    "case", [case for case in OFF_POLICY if case[0] in ("td3", "td3_discrete", "sac")], ids="-".join
-)
-def test_an_actor_critic_warms_up_in_its_first_episodes(case):
-    _, agent, _ = parts(case)
-    state, _ = started(case)
-    got = [bool(agent.begin_episode(state, jnp.int32(n)).is_warming_up) for n in range(5)]
-    assert got == [True, True, True, False, False]
 
 
 @every_off_policy_agent
@@ -297,9 +269,3 @@ class Fixed(AgentConfig):
 )
 def test_an_agent_that_cannot_work_is_refused(make, field):
     assert refused(make) == field
-
-
-def test_an_agent_may_fit_every_task():
-    assert Fixed().steps_before_learning(200, 200) == 0
-    for task in (CARTPOLE, ROOM, envs.make("pendulum")):
-        assert isinstance(make_agent(Fixed(), task), sejax.Agent)

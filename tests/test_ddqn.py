@@ -6,14 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support import (
-    assert_shares,
-    drawing,
-    numpy_forward,
-    random_columns,
-    shapes_of,
-    unraveled,
-)
+from support import assert_shares, drawing, numpy_forward, random_columns, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
@@ -51,21 +44,6 @@ def random_batch(seed):
     return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
 
 
-@pytest.fixture(scope="module")
-def agent():
-    return DDQN(CONFIG, OBS_DIM, NUM_ACTIONS).agent()
-
-
-@pytest.fixture(scope="module")
-def state(agent):
-    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-
-
-@pytest.fixture(scope="module")
-def update(agent):
-    return jax.jit(agent.update)
-
-
 def state_with(agent, params, target_params):
     """A fresh state with these parameters; nothing is compiled."""
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
@@ -95,13 +73,6 @@ def test_updates_equal_torchs_on_the_same_batches(agent_name, case, config):
             for name in ("params", "target_params"):
                 expected = golden[f"{case}/{name}/{number}"]
                 np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
-
-
-def test_a_dueling_agent_trains_alone_on_a_core():
-    # In lockstep its streams' products take longer; DDQN of the same size gains by it.
-    small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
-    assert DDQN(DuelingDDQNConfig(**small), 4, 2).agent().spec.cpu_num_parallel == 1
-    assert DDQN(DDQNConfig(**small), 4, 2).agent().spec.cpu_num_parallel > 1
 
 
 # --- exploration ---------------------------------------------------------------------------------

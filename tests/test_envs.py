@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.environments import spaces
-from support import refused
+from support import assert_close, assert_equal, refused
 
 from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2, GridParams, GridWorld
@@ -25,23 +25,19 @@ CAR = {"position": (-1.2, 0.6), "velocity": (-0.07, 0.07)}
 # Where states are drawn from. CartPole: up to the walls (|x| = 2.4, 12 degrees), so that a step
 # crosses them. Acrobot and the pendulum: all angles and speeds, where clipping and wrapping act.
 # The cars: from the left wall over the goal to the right wall, at all speeds.
+WALL, PI = math.radians(12), np.pi
 STATES = {
     "cartpole": {
-        "x": (-2.4, 2.4),
-        "x_dot": (-4.0, 4.0),
-        "theta": (-math.radians(12), math.radians(12)),
-        "theta_dot": (-4.0, 4.0),
+        "x": (-2.4, 2.4), "x_dot": (-4.0, 4.0), "theta": (-WALL, WALL), "theta_dot": (-4.0, 4.0),
     },
     "acrobot": {
-        "joint_angle1": (-np.pi, np.pi),
-        "joint_angle2": (-np.pi, np.pi),
-        "velocity_1": (-4 * np.pi, 4 * np.pi),
-        "velocity_2": (-9 * np.pi, 9 * np.pi),
+        "joint_angle1": (-PI, PI), "joint_angle2": (-PI, PI),
+        "velocity_1": (-4 * PI, 4 * PI), "velocity_2": (-9 * PI, 9 * PI),
     },
     "mountain_car": CAR,
     "mountain_car_continuous": CAR,
-    "pendulum": {"theta": (-5 * np.pi, 5 * np.pi), "theta_dot": (-8.0, 8.0)},
-}
+    "pendulum": {"theta": (-5 * PI, 5 * PI), "theta_dot": (-8.0, 8.0)},
+}  # fmt: skip
 RIGHT, LEFT, DOWN, UP = range(4)
 
 
@@ -110,8 +106,8 @@ def test_steps_return_what_the_inner_loop_relies_on(name):
     if task.num_states is None:
         assert len(np.unique(obs, axis=0)) == num and np.isfinite(next_obs).all()
     alone = jax.jit(step)(keys[1], actions[1], times[1])[2]
-    for x, y in zip(alone[:4], (next_obs, next_state, reward, terminated), strict=True):
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y[1], rtol=1e-5, atol=1e-5), x, y)
+    batched = jax.tree.map(lambda x: x[1], (next_obs, next_state, reward, terminated))
+    assert_close(alone[:4], batched, rtol=1e-5, atol=1e-5)
 
 
 def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
@@ -123,9 +119,6 @@ def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
     assert shorter.max_steps == shorter.params.max_steps_in_episode == 3
     longer = dataclasses.replace(shorter, max_steps=4)
     assert longer.max_steps == longer.params.max_steps_in_episode == 4
-    assert dataclasses.replace(task, env=envs.make("acrobot").env, params=None).obs_dim == 6
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        task.max_steps = 5
 
 
 OURS = {  # where Gymnasium has no threshold, or other rules
@@ -141,14 +134,11 @@ CARTPOLES = {"cartpole": "CartPole-v0", "cartpole_v1": "CartPole-v1"}
 @pytest.mark.parametrize("name", envs.names())
 def test_limits_thresholds_and_spaces_are_the_papers_and_gymnasiums(name):
     task = make(name)
+    expected = None
     if name not in OURS:
         spec = gymnasium.spec((GYMNASIUM_IDS | CARTPOLES)[name])
-        assert (task.max_steps, task.solved_reward) == (
-            spec.max_episode_steps,
-            spec.reward_threshold,
-        )
-    else:
-        assert (task.max_steps, task.solved_reward) == OURS[name]
+        expected = spec.max_episode_steps, spec.reward_threshold
+    assert (task.max_steps, task.solved_reward) == OURS.get(name, expected)
     if name in GYMNASIUM_IDS:
         real = gymnasium.make(GYMNASIUM_IDS[name]).unwrapped
         assert real.observation_space.shape == (task.obs_dim,)
@@ -219,17 +209,9 @@ def test_a_loop_of_gymnax_sees_what_it_sees_with_gymnaxs_own():
 
     theirs, theirs_params = gymnax.make("CartPole-v1")
     theirs_params = theirs_params.replace(max_steps_in_episode=12)
-    mine = walk(envs.make("cartpole").env, params)
-    assert mine[3].sum() > 2  # truncated, and reset
-    jax.tree.map(np.testing.assert_array_equal, mine, walk(theirs, theirs_params))
-
-
-@pytest.mark.parametrize("name", ["mountain_car_continuous", "pendulum"])
-def test_a_continuous_action_may_be_a_scalar(name):
-    step = step_from(name, envs.make(name).env, envs.make(name).params)
-    states, actions = draw_steps(name, 20)
-    vectors, scalars = step(np.float32(states), actions), step(np.float32(states), actions[:, 0])
-    jax.tree.map(np.testing.assert_array_equal, vectors, scalars)
+    ours = walk(envs.make("cartpole").env, params)
+    assert ours[3].sum() > 2  # truncated, and reset
+    assert_equal(ours, walk(theirs, theirs_params))
 
 
 # --- grid worlds ---------------------------------------------------------------------------------

@@ -7,11 +7,9 @@ import shutil
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import paper_training, printed, refused
+from support import printed, refused
 
 import sejax
 from sejax.proxies import header
@@ -128,48 +126,3 @@ def test_algorithm_1_learns_an_se_whose_agents_solve_cartpole(tmp_path):
     said = printed(sys.executable, EXAMPLES / "algorithm1.py", cwd=tmp_path, env=compiled_in_full)
     returns = [float(line.rpartition(" ")[2]) for line in said.splitlines()]
     assert len(returns) == 51 and returns[0] < 60 and np.mean(returns[-5:]) > 170
-
-
-# --- own_task, own_objective, own_agent ----------------------------------------------------------
-
-
-def test_the_reacher_is_solved_by_moving_towards_the_target(examples):
-    task = examples("own_task").make_reacher(size=5)
-
-    def episode(key):
-        obs, state = task.env.reset_env(key, task.params)
-
-        def step(carry, _):
-            obs, state, total, over = carry
-            action = jnp.clip(obs * 6 / task.params.size, -1, 1)
-            obs, state, reward, terminated, _ = task.env.step_env(key, state, action, task.params)
-            return (obs, state, total + jnp.where(over, 0.0, reward), over | terminated), None
-
-        start = obs, state, jnp.float32(0), jnp.bool_(False)
-        (_, _, total, over), _ = jax.lax.scan(step, start, length=task.max_steps)
-        return total, over
-
-    totals, over = jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(0), 100))
-    assert over.all() and totals.mean() > task.solved_reward
-
-
-def test_risk_is_a_deviation_between_an_agents_episodes(examples):
-    objective = examples("own_objective").RiskAverse(aversion=2.0).make(None)
-    returns = jnp.array([[1.0, 3.0], [2.0, 2.0], [5.0, 5.0]])
-    outcome = sejax.Outcome(
-        test_returns=returns, scored_returns=returns, train_steps=jnp.ones(3, int),
-        train_episodes=jnp.ones(3, int), auc=jnp.zeros(3), real_steps=jnp.ones(3, int),
-        nonfinite=jnp.array([False, False, True]),
-    )  # fmt: skip
-    np.testing.assert_allclose(objective(outcome), [2.0 - 2.0, 2.0, jnp.nan])  # mean 2, std 1
-
-
-@pytest.mark.slow
-def test_sac_learns_pendulum(examples):
-    own_agent = examples("own_agent")
-    task = sejax.envs.make("pendulum")
-    agent = sejax.make_agent(own_agent.SAC(), task)
-    training = paper_training(stop_rule="never", max_steps=15_000)
-    keys = jax.random.split(jax.random.key(7), 6)
-    outcome = sejax.evaluate_agents(agent, task.env, task.params, task, training, keys)
-    assert (outcome.test_return > -300).sum() >= 4

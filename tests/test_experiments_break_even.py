@@ -52,24 +52,6 @@ def test_students_of_an_se_take_no_real_step_and_those_of_an_rn_do():
     assert rn.break_even == 1e6 / 500 and rn.student_real_steps_mean == 500
 
 
-def test_the_cheapest_bandit_is_one_whose_students_are_good_enough(tmp_path, monkeypatch):
-    summary = break_even.summarise(stored())
-    missing = break_even.with_nulls(summary, tmp_path).iloc[0]
-    assert missing[["by_hand_real_steps", "best_of_four_break_even"]].isna().all()
-    rows = [("by_hand", 0, 180), ("best_of_four", 9000, 190), ("best_of_four", 32_000, 199),
-            ("best_of_four", 40_000, 200), ("agent", 10, 200)]  # fmt: skip
-    columns = ["source", "real_steps", "test_return_mean"]
-    table = pd.DataFrame(rows, columns=columns).assign(kind="ddqn", hparams="default", cpu_s=1.0)
-    monkeypatch.setattr(break_even, "stored_nulls", lambda path: table)
-    found = break_even.with_nulls(summary, tmp_path).iloc[0]
-    assert found["by_hand_test_return_mean"] == 180 and found["by_hand_break_even"] == 0
-    assert found["best_of_four_real_steps"] == 32_000
-    assert found["best_of_four_break_even"] == 32
-    (row,) = break_even.make_table(break_even.with_nulls(summary, tmp_path)).to_dict("records")
-    assert row["agents until it breaks even"].startswith("1,000 [")
-    assert row["an SE of the best of four"] == "32,000; 199.0"
-
-
 def test_costs_are_those_of_the_card():
     for card in sejax.pretrained():
         costs = proxy_users.costs_of(card.name)

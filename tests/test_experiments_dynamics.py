@@ -1,19 +1,13 @@
 """The experiments on SEs that teach through their dynamics."""
 
-import dataclasses
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from support import paper_se, refuse, refused
+from support import refuse, refused
 from test_experiments import save_ses
 
-import sejax
 from experiments import se_dynamics, se_myopia
 from experiments.common import runs
-from experiments.common.agents import OUTCOMES
 from experiments.common.statistics import mean_interval
 
 # --- the myopia test ------------------------------------------------------------------------------
@@ -63,25 +57,6 @@ def test_sets_are_summarised_over_their_ses_and_share_those_that_are_in_both():
     assert one["return_0_mean"] == 100 and two["return_0_mean"] == 50
     assert one["return_0_low"] == 100 and np.isnan(two["return_0_low"]), "two SEs are too few"
     assert two["return_0_99_worst"] == 60, "of twenty agents the two worst, 20 and 100"
-
-
-@pytest.mark.slow
-def test_a_discount_that_is_traced_is_that_of_the_configuration():
-    task = sejax.envs.make("cartpole")
-    env = paper_se(hidden_size=4).make(task)
-    training = sejax.TrainingConfig(max_steps=40, max_episodes=40, stop_rule="never")
-    config = sejax.DDQNConfig(hidden_size=4, batch_size=4, num_layers=1, warmup_episodes=0)
-    key, params = jax.random.key(3), env.params(env.init_weights(jax.random.key(5)), 0.99)
-
-    def outcome(discount):
-        agent = sejax.make_agent(dataclasses.replace(config, discount=discount), task)
-        return sejax.make_evaluator(agent, env, task, training)(key, params)
-
-    run = jax.jit(se_myopia.make_run(sejax.make_agent(config, task), env, task, training))
-    for discount in (0.0, 0.9):
-        found = run(key, (jnp.float32(discount), params), True)
-        jax.tree.map(np.testing.assert_array_equal, found, outcome(discount))
-        assert len(OUTCOMES.to_table(jax.tree.map(lambda x: x[None], found), {})) == 1
 
 
 def test_ses_are_found_by_their_task_and_named_by_their_file(tmp_path):

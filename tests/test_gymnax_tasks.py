@@ -13,13 +13,13 @@ from gymnax.environments import spaces
 from gymnax.environments.classic_control import cartpole
 from gymnax.registration import registered_envs
 from gymnax.wrappers.purerl import StickyActionWrapper
-from support import paper_se, refusal, refused
+from support import assert_equal, paper_se, refusal, refused
 
 import sejax
 from sejax import envs
 from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
-from sejax.envs.wrappers import AsVectors, Wrapper
+from sejax.envs.wrappers import AsVectors
 from sejax.options import registry
 
 DOWNLOADS = {"MNISTBandit-bsuite"}  # what it plays with
@@ -44,12 +44,12 @@ def test_every_environment_of_gymnax_is_a_task(gymnax_id):
     after, next_state, reward, terminated, _ = jax.eval_shape(
         env.step_env, KEY, state, action, params
     )
-    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     if task.num_states is None:
         assert obs.shape == (task.obs_dim,) and obs.dtype == jnp.float32
     else:
         assert obs.shape == () and jnp.issubdtype(obs.dtype, jnp.integer)
-    assert kind(after) == kind(obs) and kind(next_state) == kind(state)
+    type_of = lambda x: (x.shape, x.dtype)  # noqa: E731
+    assert jax.tree.map(type_of, (after, next_state)) == jax.tree.map(type_of, (obs, state))
     assert reward.shape == terminated.shape == () and terminated.dtype == bool
     if task.num_actions is None:
         assert action.shape == (task.action_dim,)
@@ -64,22 +64,18 @@ def test_every_environment_of_gymnax_is_a_task(gymnax_id):
 def test_steps_are_those_of_gymnax_as_vectors(gymnax_id):
     task = task_of(gymnax_id)
     raw, params = gymnax.make(gymnax_id)
-    seen = lambda obs: obs if task.num_states else jnp.ravel(obs).astype(jnp.float32)  # noqa: E731
 
-    @jax.jit
-    def both(key):
-        def walk(env, seen):
-            obs, state = env.reset_env(key, params)
-            out = env.step_env(key, state, jnp.int32(1), params)
-            return seen(obs), (seen(out[0]), out[1], jnp.float32(out[2]), *out[3:])
+    def walk(env, key):
+        obs, state = env.reset_env(key, params)
+        return obs, *env.step_env(key, state, jnp.int32(1), params)
 
-        return walk(raw, seen), walk(task.env, lambda obs: obs)
-
-    expected, got = both(jax.random.key(3))
-    assert jax.tree.structure(got) == jax.tree.structure(expected)
-    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
-        assert a.shape == b.shape and a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
+    both = jax.jit(lambda key: (walk(raw, key), walk(task.env, key)))
+    (obs, next_obs, *expected), got = both(KEY)
+    if not task.num_states:
+        obs, next_obs = (np.float32(np.ravel(x)) for x in (obs, next_obs))
+    expected[1] = np.float32(expected[1])  # the reward
+    assert_equal(got, (obs, next_obs, *expected))
+    assert all(x.dtype == y.dtype for x, y in zip(got[:2], (obs, next_obs), strict=True))
 
 
 def test_limit_and_threshold_are_those_asked_for_or_known():
@@ -117,28 +113,42 @@ def test_one_that_another_package_registers_is_a_task():
 # --- spaces that gymnax allows -------------------------------------------------------------------
 
 
-class Odd(gymnax.environments.environment.Environment):
-    """An environment of any spaces; the observation is what the action came to."""
+class Plain:
+    """An environment that has all that sejax uses, and is not derived from gymnax's."""
 
-    def __init__(self, action, obs):
-        self.action, self.obs = action, obs
+    default_params = gymnax.EnvParams(max_steps_in_episode=3)
+    is_truncated = gymnax.environments.environment.Environment.is_truncated
+    actions, observations = spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))
+    obs, reward, terminated = np.zeros(2), 0.0, np.bool_(False)
 
     def reset_env(self, key, params):
-        return jnp.zeros(self.obs.shape), gymnax.EnvState(time=0)
+        return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
 
     def step_env(self, key, state, action, params):
-        return jnp.resize(jnp.float32(action), self.obs.shape), state, 0.0, jnp.bool_(False), {}
+        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
 
     def action_space(self, params):
-        return self.action
+        return self.actions
 
     def observation_space(self, params):
-        return self.obs
+        return self.observations
 
 
-def odd_task(action, obs=None):
-    obs = spaces.Box(-1.0, 1.0, (2,)) if obs is None else obs
-    return Task(name="odd", env=Odd(action, obs), params=gymnax.EnvParams(max_steps_in_episode=3))
+def changed(**attributes):
+    """The plain environment but for these attributes."""
+    return type("Changed", (Plain,), attributes)()
+
+
+def echo(self, key, state, action, params):
+    """The observation is what the action came to."""
+    obs = jnp.resize(jnp.float32(action), self.obs.shape)
+    return obs, state, 0.0, jnp.bool_(False), {}
+
+
+def odd_task(actions, observations=Plain.observations):
+    obs = np.zeros(getattr(observations, "shape", 2))
+    env = changed(actions=actions, observations=observations, obs=obs, step_env=echo)
+    return Task(name="odd", env=env)
 
 
 def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
@@ -159,60 +169,40 @@ def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
         np.testing.assert_allclose(obs, expected, rtol=1e-6)
 
 
-def test_environments_that_agents_can_take_as_they_are_are_left_alone():
-    for action in (spaces.Discrete(2), spaces.Box(-2.0, 2.0, (1,))):
-        assert isinstance(odd_task(action).env, Odd)
-        assert isinstance(Task(name="mine", env=Wrapper(odd_task(action).env)).env, Wrapper)
-    assert odd_task(spaces.Box(-2.0, 2.0, (1,))).max_action == 2.0
-    wide = spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,))
-    for action in (spaces.Box(-2.0, 2.0, ()), spaces.Box(-2.0, 1.0, (1,)), wide):
-        assert isinstance(odd_task(action).env, AsVectors)
-    assert isinstance(odd_task(spaces.Discrete(2), spaces.Box(0, 1, (2, 2))).env, AsVectors)
+@pytest.mark.parametrize(
+    ("is_wrapped", "spaces_of_env"),
+    [
+        (False, (spaces.Discrete(2),)),
+        (False, (spaces.Box(-2.0, 2.0, (1,)),)),
+        (True, (spaces.Box(-2.0, 2.0, ()),)),
+        (True, (spaces.Box(-2.0, 1.0, (1,)),)),
+        (True, (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)),)),
+        (True, (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)))),
+    ],
+)
+def test_environments_that_agents_can_take_as_they_are_are_left_alone(is_wrapped, spaces_of_env):
+    assert isinstance(odd_task(*spaces_of_env).env, AsVectors) == is_wrapped
 
 
 DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])
 
 
 @pytest.mark.parametrize(
-    ("action", "obs"),
+    "spaces_of_env",
     [
-        (DICT, None),
-        (TUPLE, None),
+        (DICT,),
+        (TUPLE,),
         (spaces.Discrete(2), DICT),
-        (spaces.Box(-jnp.inf, 1.0, (1,)), None),
-        (spaces.Box(-1.0, jnp.inf, (1,)), None),
-        (spaces.Box(1.0, 1.0, (1,)), None),
+        (spaces.Box(-jnp.inf, 1.0, (1,)),),
+        (spaces.Box(-1.0, jnp.inf, (1,)),),
+        (spaces.Box(1.0, 1.0, (1,)),),
     ],
 )
-def test_spaces_that_no_agent_could_use_are_refused(action, obs):
-    assert refused(odd_task, action, obs) == "env"
+def test_spaces_that_no_agent_could_use_are_refused(spaces_of_env):
+    assert refused(odd_task, *spaces_of_env) == "env"
 
 
 # --- environments with a fault -------------------------------------------------------------------
-
-
-class Plain:
-    """An environment that has all that sejax uses, and is not derived from gymnax's."""
-
-    default_params = gymnax.EnvParams(max_steps_in_episode=3)
-    is_truncated = Odd.is_truncated
-    obs, reward, terminated = np.zeros(2), 0.0, np.bool_(False)
-
-    def reset_env(self, key, params):
-        return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
-
-    def step_env(self, key, state, action, params):
-        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
-
-    def action_space(self, params):
-        return spaces.Discrete(2)
-
-    def observation_space(self, params):
-        return spaces.Box(-1.0, 1.0, (2,))
-
-
-def with_fault(**attributes):
-    return type("Faulty", (Plain,), attributes)()
 
 
 def drifts(self, key, state, action, params):
@@ -224,62 +214,39 @@ class Limit(NamedTuple):
 
 
 @pytest.mark.parametrize(
-    ("env", "options", "fault"),
+    ("env", "options", "field"),
     [
-        (with_fault(is_truncated=None), {}, "TypeError"),
-        (with_fault(action_space=lambda self, params: {}["actions"]), {}, "KeyError: 'actions'"),
-        (
-            with_fault(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)),
-            {},
-            "returns obs, state, reward, terminated and info",
-        ),
-        (with_fault(obs=np.zeros(3)), {}, "obs"),
-        (with_fault(step_env=drifts), {}, "state.time"),
-        (with_fault(terminated=np.float32(0)), {}, "terminated"),
-        (with_fault(reward=np.zeros(2)), {}, "reward"),
-        (gymnax.make("CartPole-v1"), {}, "default_params"),
-        (Plain(), {"params": Limit(), "max_steps": 5}, "replace"),
-        (Plain(), {"params": gymnax.EnvState(time=0)}, "max_steps_in_episode"),
-        (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "step_env in place of reset and step"),
-        (Plain(), {"solved_reward": "high"}, "solved_reward"),
-        (Plain(), {"solved_reward": math.nan}, "solved_reward"),
-        (Plain(), {"max_steps": 0}, "max_steps"),
+        (changed(is_truncated=None), {}, "env"),
+        (changed(action_space=lambda self, params: {}["actions"]), {}, "env"),
+        (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
+        (changed(obs=np.zeros(3)), {}, "env"),
+        (changed(step_env=drifts), {}, "env"),
+        (changed(terminated=np.float32(0)), {}, "env"),
+        (changed(reward=np.zeros(2)), {}, "env"),
+        (gymnax.make("CartPole-v1"), {}, "env"),  # a pair
+        (Plain(), {"params": Limit(), "max_steps": 5}, "env"),
+        (Plain(), {"params": gymnax.EnvState(time=0)}, "env"),
+        (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "env"),  # whose step is never called
+        (Plain(), {"solved_reward": "high"}, "env.solved_reward"),
+        (Plain(), {"solved_reward": math.nan}, "env.solved_reward"),
+        (Plain(), {"max_steps": 0}, "env.max_steps"),
     ],
 )
-def test_a_fault_is_told_before_an_agent_trains(env, options, fault):
+def test_a_fault_is_told_before_an_agent_trains(env, options, field):
     assert Task(name="mine", env=Plain()).max_steps == 3
-    error = refusal(Task, name="mine", env=env, **options)
-    assert error.field in ("env", "env.max_steps", "env.solved_reward")
-    assert fault in str(error)
-
-
-def branches(self, key, state, action, params):
-    reward = 1.0 if action > 0 else 0.0
-    return jnp.zeros(2), state, reward, jnp.bool_(False), {}
+    assert refused(Task, name="mine", env=env, **options) == field
 
 
 def reads(self, key, state, action, params):
     return jnp.zeros(2), state, float(action), jnp.bool_(False), {}
 
 
-@pytest.mark.parametrize("step_env", [branches, reads])
-def test_a_fault_in_code_of_ones_own_is_told_with_its_place(step_env):
-    error = refusal(Task, name="mine", env=with_fault(step_env=step_env))
-    said, line = str(error), step_env.__code__.co_firstlineno + 1
+def test_a_fault_in_code_of_ones_own_is_told_with_its_place():
+    error = refusal(Task, name="mine", env=changed(step_env=reads))
+    said, line = str(error), reads.__code__.co_firstlineno + 1
     source = Path(__file__).read_text().splitlines()[line - 1].strip()
     assert error.field == "env" and "use jnp.where" in said
     assert f"test_gymnax_tasks.py:{line}: {source[:60]}" in said and "Derive it" not in said
-
-
-def test_limits_may_be_numbers_of_numpy_and_jax():
-    assert Task(name="mine", env=Plain(), params=Limit(jnp.int32(4))).max_steps == 4
-    assert type(Task(name="mine", env=Plain(), max_steps=np.int64(7)).max_steps) is int
-
-
-def test_a_wrapper_whose_step_would_never_be_called_is_refused_as_a_proxy_too():
-    agent = sejax.make_agent(sejax.DDQNConfig(), Task(name="plain", env=cartpole.CartPole()))
-    wrapper = StickyActionWrapper(cartpole.CartPole(), 1.0)
-    assert refused(sejax.make_trainer, agent, wrapper) == "env"
 
 
 def test_a_wrapper_that_hands_on_what_it_does_not_change_is_taken():

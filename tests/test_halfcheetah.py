@@ -49,13 +49,11 @@ def test_steps_are_braxs():
 
         return jax.lax.scan(step, brax_env.reset(KEY), actions)[1]
 
-    first, obs, reward, terminated, info = walk_of(task.env, task.params)
+    _, obs, reward, terminated, info = walk_of(task.env, task.params)
     expected = jax.jit(walk_in_brax)(ACTIONS)
     metrics = {name: info[name] for name in expected[2]}
     chex.assert_trees_all_close((obs, reward, metrics), expected, rtol=1e-4, atol=1e-5)
     assert not terminated.any() and (info["discount"] == 1.0).all()
-    other, _ = task.env.reset_env(jax.random.key(0), task.params)
-    assert np.abs(first - other).max() > 1e-3
     late = EnvState(time=jnp.array([999, 1000]))
     assert list(task.env.is_truncated(late, task.params)) == [False, True]
 
@@ -99,7 +97,6 @@ WEIGHTED = "proxy.variant=exclusive_weighted_info"
         ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
         ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
         ([ENV, RN, "agent=ddqn"], "agent"),
-        (["env=pendulum", RN, "preset=paper"], "preset"),
         (["env=hopper", "env.reset_noise_scale=-1"], "env.reset_noise_scale"),
         (["env=ant", "env.ctrl_cost_weight=1e31"], "env.ctrl_cost_weight"),
     ],

@@ -10,11 +10,8 @@ import pytest
 from flax import struct
 from support import assert_equal, random_columns, shapes_of, unraveled
 
-from sejax import envs
-from sejax.agents import make_agent
 from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
-from sejax.agents.dqn import DDQNConfig
 from sejax.agents.exploration import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
@@ -84,38 +81,18 @@ def model_of(config):
     return model, lambda flat: unraveled(flat, variables)
 
 
-@pytest.fixture(scope="module")
-def updates():
-    """Jitted updates of the wrapped stub by kind, `(key, state, batch, number=1) -> state`."""
-
-    def updates_of(kind):
-        agent = curious(kind)
-
-        @jax.jit
-        def update(key, state, batch, number=1):
-            return jax.lax.fori_loop(
-                0, number, lambda _, state: agent.update(key, state, batch), state
-            )
-
-        return update
-
-    return {kind: updates_of(kind) for kind in KINDS}
-
-
 @functools.cache
-def initial(kind):
-    """A fresh state with the parameters that torch started from; nothing is compiled."""
-    agent = curious(kind)
-    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
-    hparams = jax.tree.map(np.float32, agent.hparams.replace(agent=None))
-    return state.replace(params=np.load(GOLDEN)[f"{kind}/params/0"], hparams=hparams)
+def update_of(kind):
+    """The wrapped stub's jitted update."""
+    return jax.jit(curious(kind).update)
 
 
 def fresh(kind, **hparams):
-    """A wrapped stub with these hyperparameters."""
-    state = initial(kind)
-    numbers = {name: np.float32(x) for name, x in hparams.items()}
-    return state.replace(hparams=state.hparams.replace(**numbers))
+    """A wrapped stub with the parameters that torch started from; nothing is compiled."""
+    agent = curious(kind)
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    hparams = jax.tree.map(np.float32, agent.hparams.replace(agent=None, **hparams))
+    return state.replace(params=np.load(GOLDEN)[f"{kind}/params/0"], hparams=hparams)
 
 
 def bonus(state, batch):
@@ -133,12 +110,12 @@ def test_large_logits_make_a_large_and_finite_loss():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
+def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind):
     golden = np.load(GOLDEN)  # made by torch_icm.py
     state = fresh(kind)
     for number in range(1, 6):
         batch = random_batch(number, kind)
-        state = updates[kind](KEY, state, batch)
+        state = update_of(kind)(KEY, state, batch)
         if number in (1, 5):
             expected = golden[f"{kind}/params/{number}"]
             np.testing.assert_allclose(state.params, expected, rtol=1e-5, atol=2e-6)
@@ -151,17 +128,17 @@ def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
 # --- what the agent sees -------------------------------------------------------------------------
 
 
-def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
+def test_indices_and_their_one_hot_vectors_have_the_same_bonus():
     # Discrete TD3 keeps vectors: they go to the forward model as they are.
     batch = random_batch(4, "index")
     state = fresh("index", learning_rate=0.0)
     one_hot = batch._replace(action=np.eye(WIDTH, dtype=np.float32)[:, batch.action])
-    expected = bonus(updates["index"](KEY, state, batch), batch)
+    expected = bonus(update_of("index")(KEY, state, batch), batch)
     keeping = state.replace(agent_state=state.agent_state.replace(batch=one_hot))
-    got = bonus(updates["index"](KEY, keeping, one_hot), batch)
+    got = bonus(update_of("index")(KEY, keeping, one_hot), batch)
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
     flipped = batch._replace(action=1 - batch.action)
-    assert np.abs(bonus(updates["index"](KEY, state, flipped), batch) - expected).max() > 1e-4
+    assert np.abs(bonus(update_of("index")(KEY, state, flipped), batch) - expected).max() > 1e-4
 
 
 # --- rollouts ------------------------------------------------------------------------------------
@@ -178,33 +155,17 @@ def as_rollout(batch, is_full=True):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind, updates):
+def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind):
     batch, state = random_batch(1, kind), fresh(kind)
     rollout = as_rollout(batch)
-    before = updates[kind](
+    before = update_of(kind)(
         KEY, fresh(kind, learning_rate=0), batch
     )  # the bonus by the models as they were
-    trained = updates[kind](KEY, state, batch)
-    after = updates[kind](KEY, state, rollout)
+    trained = update_of(kind)(KEY, state, batch)
+    after = update_of(kind)(KEY, state, rollout)
     np.testing.assert_allclose(bonus(after, batch), bonus(before, batch), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(after.params, trained.params, rtol=1e-5, atol=1e-6)
     assert np.abs(bonus(trained, batch) - bonus(before, batch)).max() > 1e-4
     assert after.agent_state.updates == 1
     changed = (np.asarray(after.agent_state.rows) != rollout.rows).any(axis=0)
     assert list(np.flatnonzero(changed)) == [rollout.rows.shape[1] - 3]  # the rewards alone
-
-
-# --- the rest of the agent -----------------------------------------------------------------------
-
-
-def test_a_fresh_module_has_the_configured_numbers():
-    agent = curious("index")
-    expected = {"learning_rate": 0.01, "forward_weight": 0.3, "reward_scale": 0.5, "agent": ()}
-    assert vars(agent.hparams) == expected
-
-
-def test_a_curious_agent_trains_alone_on_a_core():
-    # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
-    task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
-    assert make_agent(small, task).spec.cpu_num_parallel > 1
-    assert make_agent(small, task, ICMConfig()).spec.cpu_num_parallel == 1

@@ -11,9 +11,8 @@ from support import refused
 import sejax
 from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
-from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
+from sejax.es.evosax import ALGORITHMS, EvosaxConfig, from_evosax
 from sejax.es.nes import NESConfig
-from sejax.options import registry
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
@@ -168,43 +167,18 @@ def test_diverged_scores_never_reach_the_mean():
     np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_enormous_noise_that_diverged_leaves_no_trace():
-    # Weights are 0 where eps is 1e30: the product must be 0 and not nan.
-    strategy, ask, tell = nes()
-    start = strategy.init(jax.random.key(0), jnp.array(MEAN))
-    candidates, state = ask(jax.random.key(1), start.replace(noise_std=jnp.float32(1e30)))
-
-    def mean_after(scores):
-        return tell(jax.random.key(2), candidates, jnp.array(scores, jnp.float32), state).mean
-
-    np.testing.assert_allclose(
-        mean_after([NAN, 1, NAN, NAN, 0, NAN, 0, 0, 0]), candidates[1], rtol=1e-5
-    )
-    np.testing.assert_array_equal(mean_after([NAN] * 6 + [0, 0, 0]), MEAN)
-
-
 # --- contract of every strategy ------------------------------------------------------------------
 
 
-def evosax_strategy(name, **fields):
-    config = EvosaxConfig(
-        name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1, **fields
+def evosax_strategy(name):
+    return EvosaxConfig(name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1).make(
+        DIMS
     )
-    return config.make(DIMS)
 
 
-def test_the_names_are_those_of_evosaxs_classes_and_of_the_registry():
-    from evosax.algorithms import distribution_based_algorithms
-
-    classes = {cls for cls, *_ in ALGORITHMS.values()}
-    assert classes <= set(distribution_based_algorithms)
-    assert registry.names("es") == ["nes", *ALGORITHMS]
-
-
-@pytest.mark.parametrize("decay", [1.0, 0.5])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name, decay):
-    dims, std = 200, 0.05
+def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name):
+    dims, std, decay = 200, 0.05, 0.5
     config = EvosaxConfig(name=name, population_size=32, noise_std=std, noise_std_decay=decay)
     strategy = config.make(dims)
     state = strategy.init(jax.random.key(0), jnp.zeros(dims))
@@ -216,17 +190,15 @@ def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(na
 
 def test_step_size_and_decay_of_the_noise_reach_an_algorithm():
     dims, key = 200, jax.random.key(0)
-    strategy = EvosaxConfig(
-        name="open_es", population_size=64, noise_std=0.1, noise_std_decay=0.5, step_size=0.02
-    ).make(dims)
-    state, spreads, means = strategy.init(key, jnp.zeros(dims)), [], []
-    for i in range(3):
-        members, state = strategy.ask(jax.random.key(i), state)
-        spreads.append(float(jnp.std(members - strategy.incumbent(state))))
-        state = strategy.tell(key, members, members.sum(axis=1), jnp.float32(0), state)
-        means.append(np.asarray(strategy.incumbent(state)))
-    np.testing.assert_allclose(spreads, [0.1, 0.05, 0.025], rtol=0.1)
-    np.testing.assert_allclose(np.abs(means[0]), 0.02, rtol=1e-2)  # Adam's first step
+    fields = {"noise_std": 0.1, "noise_std_decay": 0.5, "step_size": 0.02}
+    strategy = EvosaxConfig(name="open_es", population_size=64, **fields).make(dims)
+    state = strategy.init(key, jnp.zeros(dims))
+    members, state = strategy.ask(key, state)
+    state = strategy.tell(key, members, members.sum(axis=1), jnp.float32(0), state)
+    mean = strategy.incumbent(state)
+    np.testing.assert_allclose(np.abs(mean), 0.02, rtol=1e-2)  # Adam's first step
+    members, _ = strategy.ask(jax.random.key(1), state)
+    assert float(jnp.std(members - mean)) == pytest.approx(0.05, rel=0.1)
 
 
 def another_of_evosax(num_dims):
@@ -285,29 +257,3 @@ def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
     scores = climb(strategy, generations=80)
     np.testing.assert_allclose(scores[0], -1.15, rtol=1e-5)
     assert scores[-1] > -0.75  # a third of the way, in score
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"noise_std": 0.1, "step_size": 1.0},
-        {"noise_std": 0.1, "step_size": 1.0, "mirrored": False},
-        # divided by n_p sigma = 1.6: the same step with alpha = 1.6
-        {"noise_std": 0.1, "step_size": 1.6, "update_rule": "paper"},
-        {"noise_std": 0.1, "step_size": 0.2, "score_transform": "nes_unnormalized"},
-    ],
-    ids=str,
-)
-def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
-    paper = {"population_size": 16, "num_incumbent_evals": None, "noise_std_decay": 1.0}
-    scores = climb(NESConfig(**paper, **fields).make(DIMS), 40)
-    assert scores[0] < -1.1 and scores[-1] > -0.1
-
-
-def test_nonfinite_fitness_is_just_worse_than_the_worst():
-    # evosax minimises. Worst 3, best 1: 3 + (3 - 1) = 5. One finite value 2: 2 + 1. None: 0.
-    np.testing.assert_array_equal(finite_fitness(jnp.array([1.0, NAN, 3.0, INF])), [1, 5, 3, 5])
-    np.testing.assert_array_equal(finite_fitness(jnp.array([2.0, -INF])), [2, 3])
-    np.testing.assert_array_equal(finite_fitness(jnp.array([NAN, INF])), [0, 0])
-    # A strategy that remembers the best must not take that for one.
-    np.testing.assert_array_equal(finite_fitness(jnp.array([NAN, INF]), INF), [INF, INF])

@@ -1,6 +1,5 @@
 """sejax.presets: the settings that were published are the paper's, number for number."""
 
-import dataclasses
 import functools
 from pathlib import Path
 
@@ -10,7 +9,6 @@ from support import paper_training, refused
 
 import sejax
 from experiments.common.reward_networks import STUDIES
-from sejax.agents.ppo import PPOConfig
 from sejax.options import registry
 from sejax.runs import preset_files
 
@@ -85,30 +83,7 @@ def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
     assert composed.agent == STUDIES[env].transfer_agent  # see test_experiments_rn.py
 
 
-def test_the_best_preset_has_a_quick_ppo_for_mountain_car_continuous():
-    """The paper's, which learns eight or sixteen times as often, in fewer and shorter trainings."""
-    study = STUDIES["mountain_car_continuous"]
-    composed = composed_with("env=mountain_car_continuous", "proxy=rn", "agent=ppo")
-    assert composed.training.max_episodes < 100 and composed.es.num_evals > 1
-    for quick in (composed.agent, study.tuned_agent):
-        assert 7 * quick.rollout_length(999) < study.transfer_agent.rollout_length(999) == 1999
-        freed = {"rollout_steps": None, "learning_rate": 3e-4, "init_action_std": 0.5}
-        assert dataclasses.replace(quick, **freed) == study.transfer_agent
-
-
-@pytest.mark.parametrize("env", ["cartpole", "mountain_car", "mountain_car_continuous"])
-def test_ppo_on_ses_is_the_default(env):
-    assert composed_with(f"env={env}", "agent=ppo").agent == PPOConfig()
-
-
 # --- the files -----------------------------------------------------------------------------------
-
-
-def test_what_is_tuned_is_known():
-    assert preset_files.names() == ["best", "distilled", "paper", "paper_performance", "soft"]
-    assert preset_files.tuned("rn") == sorted([*RN_TASKS, "pendulum"])
-    assert preset_files.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert preset_files.is_tuned("acrobot", "se") and not preset_files.is_tuned("acrobot", "rn")
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
@@ -122,30 +97,14 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
                 assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
 
 
-def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():
-    words = "env=cartpole", "proxy=rn"
-    paper, best = (composed_with(*words, f"preset={name}") for name in ("paper", "best"))
-    assert paper.proxy.variant == "additive_potential"
-    assert best.proxy.variant == "exclusive_potential"
-    assert paper.agent == best.agent and paper.training == best.training
-    assert (paper.es.step_size, best.es.step_size) == (0.5, 0.5)
-
-
-@pytest.mark.parametrize("proxy", ["se", "rn"])
-def test_a_task_without_a_file_has_general_settings(proxy):
-    composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
-    if proxy == "se":  # whose settings are the defaults in Python
-        assert composed.generations == 100
-    else:
-        assert composed.proxy == sejax.RewardConfig() and composed.generations == 50
-        limits = {"stop_rule": "solved", "max_episodes": 100, "test_episodes": 1}
-        assert composed.training == paper_training(**limits)
-    words = ["env=gymnax/MountainCar-v0", f"proxy={proxy}", "preset=paper"]
-    assert refused(sejax.config, words) == "preset"
+@pytest.mark.parametrize(("proxy", "generations"), [("se", 100), ("rn", 50)])
+def test_a_task_without_a_file_has_general_settings(proxy, generations):
+    words = ["env=gymnax/MountainCar-v0", f"proxy={proxy}"]
+    assert composed_with(*words).generations == generations
+    assert refused(sejax.config, [*words, "preset=paper"]) == "preset"
 
 
 @pytest.mark.parametrize(("env", "steps"), [("mountain_car", 2000), ("halfcheetah", 200)])
 def test_settings_of_an_objective_hold_for_that_objective(env, steps):
-    for _ in range(2):  # which leaves the preset as it is
-        assert sejax.config([f"env={env}"]).objective.first_eval_steps == steps
+    assert sejax.config([f"env={env}"]).objective.first_eval_steps == steps
     assert not hasattr(sejax.config([f"env={env}", "objective=auc"]).objective, "first_eval_steps")

@@ -8,23 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import (
-    assert_shares,
-    drawing,
-    numpy_forward,
-    random_columns,
-    shapes_of,
-    unraveled,
-)
+from support import assert_shares, drawing, numpy_forward, random_columns, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
-from sejax.agents.sac import (
-    SAC,
-    DiscreteSAC,
-    LearningNoise,
-    SACConfig,
-    squashed_gaussian,
-)
+from sejax.agents.sac import SAC, DiscreteSAC, LearningNoise, SACConfig, squashed_gaussian
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "sac_updates.npz"

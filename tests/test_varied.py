@@ -1,21 +1,19 @@
 """sejax.agents.varied: what is drawn, and that a narrowed network is exactly a small one."""
 
 import dataclasses
-import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from support import random_columns
+from support import assert_close, random_columns, shapes_of
 
 import sejax
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, Draw, Varied, drawing_key
-from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
+from sejax.agents.base import drawing_key
+from sejax.agents.buffers import Transition, block_size, sum_over_batch
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
@@ -24,6 +22,7 @@ from sejax.ops.networks import MLP, narrow
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
+KEY = jax.random.key(0)
 NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than one block
 
 
@@ -73,12 +72,6 @@ def configured(hidden_size, batch_size):
     )  # fmt: skip
 
 
-def zeros_of(init):
-    """Parameters of the right shapes, without drawing any."""
-    shapes = jax.eval_shape(init, jax.random.key(0), jnp.zeros(OBS_DIM))
-    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-
-
 def embed(small, large):
     """The small network's parameters in a large one's, whose other entries are 0."""
 
@@ -97,7 +90,9 @@ def random_batch(num_columns, seed):
 def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use():
     configs = [configured(SMALL, NUM_COLUMNS), configured(LARGE, BATCH)]
     small, large = (DDQN(config, OBS_DIM, NUM_ACTIONS).agent() for config in configs)
-    templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
+    templates = [
+        shapes_of(config.network(NUM_ACTIONS).init, KEY, np.zeros(OBS_DIM)) for config in configs
+    ]
 
     @jax.jit
     def widened(params):
@@ -190,46 +185,20 @@ def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
 # --- varied agents -------------------------------------------------------------------------------
 
 
-def test_every_drawn_agent_finds_a_network_with_room():
-    task = envs.make("cartpole")
+def test_every_drawn_agent_finds_the_smallest_network_with_room():
     config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
-    varied = make_agent(config, task, varied=True)
-    draws = jax.jit(jax.vmap(varied.varied.draw))(jax.random.split(jax.random.key(0), 200))
-    values = {name: np.asarray(x) for name, x in draws.values.items()}
+    varied = make_agent(config, envs.make("cartpole"), varied=True).varied
+    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
     bounds = ranges_of(config)
-    assert set(values) == set(bounds)
+    assert set(draws.values) == set(bounds)
     sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
-    assert len(varied.varied.agents) == sum(map(len, sizes.values()))
-
-    @functools.cache
-    def num_params(index):
-        agent = varied.varied.agents[index]
-        return jax.eval_shape(agent.init, jax.random.key(0), agent.hparams).params.shape[0]
-
-    for index, hidden, depth in zip(draws.variant.tolist(), values["hidden_size"],
-                                    values["num_layers"], strict=True):  # fmt: skip
-        room = min(size for size in sizes[int(depth)] if size >= hidden)
-        inner = (int(depth) - 1) * room * (room + 1)
-        assert num_params(index) == room * 5 + inner + 2 * (room + 1)
-    assert len(set(draws.variant.tolist())) == len(varied.varied.agents)
-
-
-def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
-    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
-    varied = make_agent(config, envs.make("cartpole"), varied=True)
-    key = jax.random.key(3)
-    drawn, values = jax.jit(
-        lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key))
-    )(key)
-    assert drawn.values == values
-    hparams = vars(drawn.hparams)
-    for name in ("learning_rate", "batch_size", "hidden_size"):
-        assert hparams.pop(name) == values[name]
-    assert hparams.pop("discount") == 0.9  # what is not varied stays as it was configured
-    # Room for the largest batch is in all variants; the agent itself is the configured one.
-    plain = make_agent(config, envs.make("cartpole"))
-    assert varied.hparams == plain.hparams and plain.drawn_values(key) == {}
-    assert plain.varied is None
+    shapes = [jax.eval_shape(x.init, KEY, x.hparams).params.shape for x in varied.agents]
+    hidden, depths = draws.values["hidden_size"].tolist(), draws.values["num_layers"].tolist()
+    for variant, width, depth in zip(draws.variant.tolist(), hidden, depths, strict=True):
+        size = min(size for size in sizes[int(depth)] if size >= width)
+        inner = (int(depth) - 1) * size * (size + 1)
+        assert shapes[variant] == (size * 5 + inner + 2 * (size + 1),)
+    assert len(set(draws.variant.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
 
 
 def test_the_agent_inside_an_exploring_one_is_varied():
@@ -242,54 +211,20 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
-class Numbers(NamedTuple):
-    rate: float
-
-
-def agent_that(name, **fields):
-    """An agent of which nothing but its identity matters."""
-    return Agent(
-        init=lambda key, hparams: name, act=None, update=None, buffer=no_buffer(),
-        hparams=Numbers(rate=1.0), **fields,
-    )  # fmt: skip
-
-
-# --- whole programs ------------------------------------------------------------------------------
-
-
-def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it():
-    plain = agent_that("has its own numbers")
-    variants = (agent_that("is the first"), agent_that("is the second"))
-    values = {"rate": jnp.array([0.25, 4.0])}
-
-    def draw(key):
-        index = jax.random.randint(key, (), 0, 2)
-        rate = values["rate"][index]
-        return Draw(variant=index, hparams=Numbers(rate), values={"rate": rate})
-
-    varied = dataclasses.replace(plain, varied=Varied(agents=variants, draw=draw))
-    built = []
-
-    def make_run(agent):
-        built.append(agent)
-        which = jnp.int32([plain, *variants].index(agent))
-        return lambda key, x, hparams: (which, hparams.rate * x, jax.random.bits(key))
-
-    keys = jax.random.split(jax.random.key(0), 12)
-    run = jax.jit(varied.fresh(make_run))
-    seen = set()
-
-    @jax.jit
-    def expected(key):  # the run has the training's own key
-        return draw(drawing_key(key)), varied.drawn_values(key), jax.random.bits(key)
-
-    for key in keys:
-        which, scaled, bits = run(key, np.float32(3.0))
-        drawn, values_of_key, expected_bits = expected(key)
-        assert (which, scaled) == (drawn.variant + 1, 3.0 * drawn.hparams.rate)
-        assert bits == expected_bits and values_of_key == drawn.values
-        seen.add(int(which))
-    assert seen == {1, 2} and built == list(variants)
-    # An agent that nothing is drawn for runs with its own.
-    which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
-    assert (which, scaled) == (0, 3.0)
+def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key():
+    task = envs.make("cartpole")
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9, warmup_episodes=1)
+    varied = make_agent(config, task, varied=True)
+    training = sejax.TrainingConfig(max_steps=60, stop_rule="never")
+    train = jax.jit(sejax.make_evaluator(varied, task.env, task, training))
+    draw = jax.jit(lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key)))
+    key = jax.random.key(0)
+    drawn, values = draw(key)
+    assert drawn.variant > 0 and drawn.values == values
+    for name in ("learning_rate", "batch_size", "hidden_size"):
+        assert getattr(drawn.hparams, name) == values[name]
+    assert drawn.hparams.discount == 0.9  # what is not varied stays as it was configured
+    variant = varied.varied.agents[int(drawn.variant)]
+    variant = dataclasses.replace(variant, hparams=drawn.hparams)
+    alone = jax.jit(sejax.make_evaluator(variant, task.env, task, training))
+    assert_close(train(key, task.params), alone(key, task.params), rtol=1e-4, atol=1e-5)
