@@ -140,7 +140,7 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     assert agent.discount(agent.hparams) == 0.9
     learns_from = 0 if case[0] == "ppo" else 3
     assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, learns_from)
-    assert agent.spec.spaces is not None
+    assert agent.spec.sizes is not None
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import refusal, refused
+from support import refusal
 
 import sejax
 from sejax import options
@@ -69,12 +69,6 @@ def test_a_whole_message():
 def test_a_value_at_the_edge_of_its_rule_is_taken(field, values):
     for value in values:
         assert getattr(Config(**{field: value}), field) == value
-
-
-def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
-    foreign = dataclasses.make_dataclass("Foreign", [("size", int, option(4, options.counts()))])
-    assert refused(options.check, foreign(size=0), "mine") == "mine.size"  # it checks not itself
-    options.check(foreign(), "mine")
 
 
 # --- what is traced, and what is varied ----------------------------------------------------------
