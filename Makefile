@@ -14,7 +14,7 @@ run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true run_dir=runs/first
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal

@@ -204,7 +204,7 @@ def make_trainer(
     Args:
       agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
-        reward has the agent's discount, whatever its params say. The plateau rule, the default,
+        reward has the agent's discount, whatever its params say. The plateau rule
         reads the returns of this world; for tests on the real task see `sejax.make_evaluator`. In a
         proxy whose params allow longer episodes than its task the buffer may hold fewer steps than
         the agent asks for.

@@ -71,3 +71,13 @@ def pytest_configure(config: pytest.Config) -> None:
 def _two_cpu_devices():
     if jax.device_count() < 2:
         pytest.exit("jax was initialised before conftest.py could ask for two CPU devices", 3)
+
+
+# Files that take longest: they come first, or one process would be left with one of them at the end.
+LONGEST = ("test_claims", "test_run", "test_agents", "test_search", "test_examples", "test_probes",
+           "test_distill", "test_policy_search", "test_run_directory", "test_bilevel")  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sorts the files of tests, with `--no-loadscope-reorder`."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)

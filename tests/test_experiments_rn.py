@@ -69,6 +69,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
     pd.testing.assert_frame_equal(without, expected)
 
 
+@pytest.mark.slow
 def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
     settings = options(RnPerformance, rns=2)
     for variant in settings.variants:

@@ -34,7 +34,7 @@ from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
-Share: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
+Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
 CAPACITY = 16  # trainings in the largest shares, where batches follow one another
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
@@ -150,7 +150,7 @@ class RayConfig(Options):
 # --- shares of a generation -----------------------------------------------------------------------
 
 
-def sizes_of(learner: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
+def portion_sizes(learner: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
     """Trainings of each agent in a batch, and most of them in a share, which is whole batches.
 
     They are the same for any number of workers, because sums over batches of other widths round
@@ -179,11 +179,11 @@ class RemoteChunks(Chunks):
         self,
         config: LearnConfig,
         num_workers: Callable[[], int],
-        compute: Callable[[Sequence[Share]], Sequence[tuple[Outcome, float]]],
+        compute: Callable[[Sequence[Portion]], Sequence[tuple[Outcome, float]]],
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._num_workers, self._compute = num_workers, compute
-        self._sizes = sizes_of(self.learner, config.num_parallel)
+        self._sizes = portion_sizes(self.learner, config.num_parallel)
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, of which chunks of any length are made."""
@@ -234,7 +234,7 @@ class RemoteChunks(Chunks):
 
     def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
         """The outcomes of each agent's trainings, leaves `[training, ...]`."""
-        shares: list[Share] = []
+        shares: list[Portion] = []
         for agent, (trainings, (width, most)) in enumerate(zip(by_agent, self._sizes, strict=True)):
             total = len(trainings.active)
             # Two shares for each worker, so that none waits long for the last one.
@@ -278,7 +278,7 @@ def num_workers(machines: RayConfig) -> int:
 
 
 def _on_cluster(
-    machines: RayConfig, setup: str, shares: Sequence[Share]
+    machines: RayConfig, setup: str, shares: Sequence[Portion]
 ) -> list[tuple[Outcome, float]]:
     """What `score` returns for each share, as many at a time as there are workers.
 
@@ -318,7 +318,7 @@ def setup_of(config: LearnConfig) -> str:
     return json.dumps([needed, runtime.versions()])
 
 
-def score(setup: str, share: Share) -> tuple[Outcome, float]:
+def score(setup: str, share: Portion) -> tuple[Outcome, float]:
     """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took.
 
     Raises:
@@ -357,7 +357,7 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 
         return jax.jit(evaluate, compiler_options=compiler_options())
 
-    sizes = sizes_of(learner, config.num_parallel)
+    sizes = portion_sizes(learner, config.num_parallel)
     return [(capacity, program_of(agent, width)) for agent, (width, capacity) in enumerate(sizes)]
 
 
