@@ -73,7 +73,7 @@ def _two_cpu_devices():
         pytest.exit("jax was initialised before conftest.py could ask for two CPU devices", 3)
 
 
-# Files that take longest: they come first, or one process would be left with one of them at the end.
+# Files that take longest come first, or one process would be left with one of them at the end.
 LONGEST = ("test_claims", "test_run", "test_agents", "test_search", "test_examples", "test_probes",
            "test_distill", "test_policy_search", "test_run_directory", "test_bilevel")  # fmt: skip
 
