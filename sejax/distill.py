@@ -27,12 +27,12 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Options, as_text, counts, help_texts, option, require
+from sejax.options import Options, as_text, counts, help_texts, option, require, shortened
 from sejax.options.plain import fields_of, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
-from sejax.runs import commands, runtime
+from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
@@ -111,15 +111,15 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     """
     values: dict[str, Any] = {}
     others = {}
-    for override in overrides:
-        name, _, text = override.partition("=")
+    for name, text in compose.words(overrides).items():
         group, _, field = name.partition(".")
         if group in fields_of(DistillConfig):
             values = merge(values, {group: {field: text} if field else text})
         else:
             fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-            require(group in TAKEN, name, f"must be left out, as it has no effect here. {fix}")
-            others[name] = override
+            message = f"must be left out, as it has no effect here. {fix}"
+            require(group in TAKEN, shortened(name, 40), message)
+            others[name] = f"{name}={text}"
     task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
     kind = envs.spec_of(task.env).actions
     steps = others.get("training.max_steps", STEPS[kind]).rpartition("=")[2]
