@@ -97,9 +97,7 @@ def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) 
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
-    of_agents = {  # not of episodes, and no agreement of ranks
-        name: x for name, x in vars(outcome).items() if x is not None and x.ndim == 1
-    }
+    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **varied})
 

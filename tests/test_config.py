@@ -301,3 +301,11 @@ def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
         assert not xla_bridge.backends_are_initialized()
     """
     printed(sys.executable, "-c", program)
+
+
+@pytest.mark.parametrize(("agent", "batch_size"), [("sac", 64), ("ddqn", 7)])
+def test_an_agent_that_is_typed_takes_the_place_of_those_of_a_file(agent, batch_size, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("agents: {ddqn: {name: ddqn, batch_size: 7}}")
+    config = sejax.config([f"preset={path}", f"agent={agent}"])
+    assert {key: x.batch_size for key, x in config.agents.items()} == {agent: batch_size}

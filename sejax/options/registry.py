@@ -1,4 +1,4 @@
-"""Names to objects: the only place where a name becomes code.
+"""Names to objects: where the name of a plugin becomes code.
 
 Everything that a configuration chooses by name is a *plugin* of a group: a dataclass whose fields
 are its options and whose `make` builds the object, or a function that builds it, whose keyword

@@ -15,7 +15,7 @@ from typing import NoReturn
 import yaml
 
 from sejax.options import ConfigError, FailedError, place_of, told
-from sejax.runs import runtime
+from sejax.runs import compose, runtime
 from sejax.runs.config import CommandConfig, plain
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -71,11 +71,13 @@ def _prepare(overrides: Sequence[str]) -> None:
 
 def _devices(overrides: Sequence[str]) -> int | None:
     """The number of devices that is asked for; 1 where trainings are computed elsewhere."""
-    values = dict(override.partition("=")[::2] for override in overrides)
-    if values.get("machines", "local") != "local":
-        return 1
-    count = values.get("devices", "")
-    return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None  # else it is refused later
+    with contextlib.suppress(ConfigError):  # which is raised later
+        values = compose.read(compose.expand(overrides)[0])
+        if values.get("machines", "local") != "local":
+            return 1
+        count = str(values.get("devices", ""))
+        return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None
+    return None
 
 
 @contextlib.contextmanager

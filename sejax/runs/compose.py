@@ -96,8 +96,13 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
     if not given.get("preset", "").endswith(preset_files.ENDING):
         return given
     of_file = preset_files.read_file(Path(expanded(given.pop("preset"))))
-    rechosen = {"agent", "agents"} if {"agent", "agents"} & given.keys() else set()
-    return {_choice(k): x for k, x in of_file.items() if k not in rechosen} | given
+    if chosen := agents_of(given):  # in place of the file's
+        others = tuple(f"agents.{key}." for key in agents_of(of_file) if key not in chosen)
+        choices = ("agent", "agents")
+        of_file = {
+            k: x for k, x in of_file.items() if k not in choices and not k.startswith(others)
+        }
+    return {_choice(k): x for k, x in of_file.items()} | given
 
 
 def _choice(name: str) -> str:
