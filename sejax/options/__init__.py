@@ -108,7 +108,8 @@ def nearest(got: object, known: Iterable[str]) -> list[str]:
 
 def listed(names: Collection[str], most: int = 120) -> str:
     """Names with commas between, as many as fit into `most` characters."""
-    return textwrap.shorten(", ".join(names), most, placeholder=" and more") if names else "none"
+    text, more = ", ".join(names) or "none", " and more"
+    return textwrap.shorten(text, most, placeholder=more, break_on_hyphens=False)
 
 
 def shortened(value: object, length: int = 80) -> str:
