@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 
 import sejax
@@ -48,21 +47,3 @@ def test_the_search_is_the_bilevel_loop(monkeypatch):
         assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
-
-
-def test_the_best_bin_and_the_ranks_are_those_of_the_means():
-    runs = pd.DataFrame({
-        "transform": ["rank"] * 4 + ["nes"] * 4, "mirrored": True, "run": [0, 1, 2, 3] * 2,
-        "step_size": [0.02, 0.05, 0.5, 5.0] * 2,
-        "updates": [10, 20, 4, 30, 5, 5, 5, 9], "solved": [1, 1, 1, 0, 1, 1, 1, 1],
-    })  # fmt: skip
-    summary = score_transforms.summarise(runs, bins=3)  # edges 0.01, 0.1, 1, 10
-    first, second = summary.itertuples()
-    assert (first.transform, first.updates_mean, first.solved) == ("nes", 6.0, 1.0)
-    assert (second.transform, second.updates_mean) == ("rank", 16.0) and second.solved == 0.75
-    assert second.best_updates == 4 and second.best_from == pytest.approx(0.1)
-    assert (first.behind_mean, second.behind_mean) == (0, 10)  # by 5, 15, -1, 21
-    cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
-    assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
-    table = score_transforms.make_table(summary)
-    assert list(table["rank"]) == ["1", "2"] and list(table["rank there"]) == ["2", "1"]

@@ -20,11 +20,9 @@ import numpy as np
 import pandas as pd
 import yaml
 
-import sejax
 from experiments.common.shards import read_rows
 from experiments.common.statistics import difference_interval, mean_interval
 from sejax.ops.files import write_text
-from sejax.proxies import zoo
 from tools import remake
 
 ROOT = Path(__file__).parents[1]
@@ -75,12 +73,7 @@ class Claims:
         return self.frames[rows]
 
     def read_frame(self, rows: str) -> Any:
-        """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, settings."""
-        if rows.startswith("settings "):
-            return sejax.config(rows.split()[1:])
-        if rows == "pretrained":
-            pairs = [(proxy, x) for proxy in zoo.pretrained() for x in proxy.evaluations]
-            return pd.DataFrame(vars(x) | vars(x.learning) | vars(y) for x, y in pairs)
+        """Stored rows: a table, or what a JSON file holds."""
         if "*" in rows:
             found = sorted(self.root.glob(rows))
             return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
@@ -114,10 +107,7 @@ class Claims:
         return names
 
     def lines(self, name: str) -> list[str]:
-        """A table in Markdown: that of an experiment, or of an entry."""
-        if name.startswith("results/"):
-            text = (self.root / name).read_text(encoding="utf-8")
-            return [line for line in text.splitlines() if line.startswith("|")]
+        """A table of an entry, in Markdown."""
         table = self.entries["tables"][name]
         made = [table["head"], " | ".join("---" for _ in table["head"].split("|"))]
         for line in table["lines"]:
@@ -130,13 +120,8 @@ class Claims:
 
     def documents(self) -> dict[str, str]:
         """The text of each document, by its path."""
-        paths = sorted(
-            [
-                *self.root.glob("*.md"),
-                *self.root.glob("docs/**/*.md"),
-                *self.root.glob("paper/*.md"),
-            ]
-        )
+        patterns = ("*.md", "docs/**/*.md", "paper/*.md")
+        paths = sorted(path for pattern in patterns for path in self.root.glob(pattern))
         texts = {str(x.relative_to(self.root)): x.read_text(encoding="utf-8") for x in paths}
         made = self.entries.get("generated", ())
         return {name: x for name, x in texts.items() if "_build" not in name and name not in made}

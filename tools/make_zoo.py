@@ -10,8 +10,7 @@ from pathlib import Path
 import sejax
 from sejax.ops.files import write_text
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "zoo.md"
+PAGE = Path(__file__).parents[1] / "docs/zoo.md"
 
 
 def page() -> str:
@@ -52,4 +51,3 @@ def table(rows: list[dict[str, str]]) -> str:
 
 if __name__ == "__main__":
     write_text(PAGE, page())
-    print(f"{PAGE} has {len(sejax.pretrained())} proxies.")
