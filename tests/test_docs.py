@@ -39,7 +39,7 @@ def python_blocks(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["README.md", "docs/howto/jax.md", "docs/distill.md"])
+@pytest.mark.parametrize("page", ["docs/howto/jax.md", "docs/distill.md"])
 def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     blocks = python_blocks(ROOT / page)
     assert blocks

@@ -2,7 +2,6 @@
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import wrappers
@@ -14,7 +13,7 @@ from sejax.gym import GridWorld, RewardNetwork, make, make_vec, networks
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.proxies import header
-from sejax.proxies.reward import VARIANTS, RewardConfig, RewardState
+from sejax.proxies.reward import VARIANTS, RewardConfig
 
 KEY = jax.random.key(0)
 NETWORKS = [variant for variant in VARIANTS if "info" not in variant]
@@ -173,14 +172,13 @@ def test_rewards_are_those_of_the_rn_in_jax(name):
             obs, _ = env.reset()
     *seen, real, rewards = (np.array(column) for column in zip(*rows, strict=True))
 
-    @jax.jit
-    @jax.vmap
-    def bonus(before, after, terminated):
-        states = [RewardState(world=None, obs=x, augmentation=jnp.zeros(0), time=0)
-                  for x in (before, after)]  # fmt: skip
-        return proxy.env.bonus(proxy.params, *states, {}, terminated)
-
-    expected = bonus(*seen) + (real if proxy.env.config.shaping.is_additive else 0)
+    config = proxy.env.config
+    potential = jax.jit(jax.vmap(lambda obs: proxy.env.potential(proxy.params, obs)))
+    before, after, ends = seen
+    expected = np.where(ends & config.zero_at_terminal, 0, potential(after))
+    if config.shaping.is_potential_based:
+        expected = proxy.params.discount * expected - potential(before)
+    expected = expected + (real if config.shaping.is_additive else 0)
     np.testing.assert_allclose(rewards, expected, rtol=1e-5, atol=1e-5)
 
 

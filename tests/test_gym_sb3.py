@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sejax.gym.sb3 import SyntheticVecEnv
 
-PAGE = Path(__file__).parents[1] / "docs/gymnasium.md"
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("name", SES)
@@ -75,12 +75,13 @@ def test_an_agent_of_theirs_trains_there(name):
 
 
 @pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")
-def test_the_page_runs():
-    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 5
+@pytest.mark.parametrize(("page", "num_blocks"), [("README.md", 3), ("docs/gymnasium.md", 5)])
+def test_the_page_runs(page, num_blocks):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    assert len(blocks) == num_blocks
     for block in blocks:
         short = re.sub(r"learn\([\d_]+\)", "learn(256)", block)
-        exec(compile(short, PAGE.name, "exec"), {})
+        exec(compile(short, page, "exec"), {})
 
 
 def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():

@@ -24,7 +24,8 @@ from sejax.runs.worlds import proxy_setup
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
-SES = [name for name, proxy in PROXIES.items() if proxy.kind == "se"]
+# Those that agents learned. Students of a distilled SE are other agents than a plain one.
+SES = [name for name, x in PROXIES.items() if x.kind == "se" and "distilled" not in name]
 ROOT = Path(__file__).parents[1]
 
 

@@ -20,7 +20,7 @@ TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
 HALFCHEETAH = {("additive_potential", "reward_threshold"), ("exclusive_weighted_info", "auc")}
 # Trainings of seconds, in which something is learned nevertheless.
 SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
-         "training.max_episodes=3"]  # fmt: skip
+         "training.max_episodes=6"]  # fmt: skip
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
