@@ -21,6 +21,7 @@ from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
+from sejax.ops.parallel import in_batches_on_cpu
 from sejax.options import (
     LARGEST,
     Options,
@@ -250,7 +251,17 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
+    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
+    train = in_batches_on_cpu(loop.train, num_parallel_on_cpu(agent, training))
+    return lambda key, env_params, hparams=None, active=True: train(
+        key, env_params, agent.hparams if hparams is None else hparams, jnp.asarray(active)
+    )
+
+
+def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+    """Agents in a vmapped batch of a CPU core; None for all, 1 if they may stop at any time."""
+    num_parallel = agent.spec.cpu_num_parallel
+    return num_parallel if num_parallel is None or training.is_fixed_length else 1
 
 
 class _Loop:
@@ -284,11 +295,10 @@ class _Loop:
         self,
         key: Array,
         env_params: PyTree,
-        hparams: Hparams | None = None,
-        active: Array | bool = True,
+        hparams: Hparams,
+        active: Array,
     ) -> TrainResult:
-        """One training; `hparams` None are the agent's own."""
-        hparams = self.agent.hparams if hparams is None else hparams
+        """One training."""
         env_params = self.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = self.begin(key_begin, env_params, hparams, active)

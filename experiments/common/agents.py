@@ -19,7 +19,7 @@ import sejax
 from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents import NoExploration
-from sejax.evaluation import num_parallel_on_cpu
+from sejax.training import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
 from sejax.options.plain import to_plain

@@ -17,6 +17,7 @@ from sejax.ops.keys import murmur, words
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
 State = TypeVar("State")  # of an agent
+T = TypeVar("T")
 
 # Columns of the reward and the discount in a packed transition.
 _REWARD, _DISCOUNT = -2, -1
@@ -305,11 +306,11 @@ def block_size(width: int) -> int:
     return max(cpu.MIN_BLOCK, cpu.whole_vectors(-(-width // cpu.NUM_BLOCKS)))
 
 
-def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Array | None) -> Array:
+def sum_over_batch(fn: Callable[[PyTree], T], batch: PyTree, batch_size: Array | None) -> T:
     """Sum of `fn` over the columns of a batch, at the cost of those that are in use.
 
     Args:
-      fn: `batch -> Array`, a sum over the batch's columns in which those of weight 0 count nothing.
+      fn: of a batch, a pytree of sums over its columns, in which those of weight 0 count nothing.
       batch: pytree of arrays whose last axis are the columns, as many as `sample` draws; scalars
         belong to all of them.
       batch_size: columns that count, from the first on, `[]`; the others must have weight 0. None
@@ -322,7 +323,7 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
         return fn(batch)
     size = block_size(max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x)))
 
-    def block(index: Array) -> Array:
+    def block(index: Array) -> T:
         def cut(x: Array) -> Array:
             if not jnp.ndim(x):
                 return x
@@ -331,6 +332,9 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
         return fn(jax.tree.map(cut, batch))
 
     num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
-    shape = jax.eval_shape(block, num_blocks)
-    zero = jnp.zeros(shape.shape, shape.dtype)
-    return jax.lax.fori_loop(0, num_blocks, lambda i, total: total + block(i), zero)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
+
+    def add(index: Array, total: T) -> T:
+        return jax.tree.map(jnp.add, total, block(index))
+
+    return jax.lax.fori_loop(0, num_blocks, add, zeros)

@@ -11,6 +11,5 @@ fast                plain                                    gain
 `networks.affine`   `kernel @ x + bias`                      1.3 times
 `networks.tanh`     `jnp.tanh`                               1.1 times (paper's DDQN)
 `keys.step_keys`    `jax.random.split(fold_in(key, step))`   1.06 times
-`flat.adam_step`    `optax.adam` on a pytree of four arrays  3 times, Adam alone
 =================== ======================================== ================================
 """
