@@ -10,13 +10,12 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
 from sejax.ops.keys import murmur, words
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
-State = TypeVar("State")  # of an agent
 T = TypeVar("T")
 
 # Columns of the reward and the discount in a packed transition.
@@ -54,11 +53,9 @@ class Rollout(NamedTuple):
 
     Attributes:
       rows: packed transitions with one more column, which is 1 where the episode ended.
-      is_full: whether the rollout has its whole length, so that the agent learns from it now.
     """
 
     rows: Float[Array, "steps width"]
-    is_full: Bool[Array, ""]
 
     @property
     def ended(self) -> Float[Array, " steps"]:
@@ -71,18 +68,6 @@ class Rollout(NamedTuple):
         action_dim = steps.shape[0] - 2 * obs_dim - 2
         is_index = is_discrete and action_dim == 1
         return unpack(steps, None if is_index else action_dim)
-
-    def learn_if_full(self, learn: Callable[[State], State], state: State) -> State:
-        """`learn(state)` if the rollout is full; else the state, at next to no cost.
-
-        It is a loop of one trip or none: under `vmap` `lax.cond` would learn in every step and
-        throw it away, whereas this loop runs only when the rollout of some agent is full.
-        """
-
-        def phase(carry: tuple[Array, State]) -> tuple[Array, State]:
-            return jnp.bool_(False), learn(carry[1])
-
-        return jax.lax.while_loop(lambda carry: carry[0], phase, (self.is_full, state))[1]
 
     def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
         """The same steps with a bonus added to each reward."""
@@ -100,15 +85,13 @@ class Buffer:
       batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
         `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
         is not None, have weight 0.
-      mask: `(batch, active) -> batch`, a batch on which the update of an agent that has finished is
-        cheap. Under `vmap` that update still runs, until all agents have finished, and is thrown
-        away. By default the batch stays as it is, since most updates always take as long.
+      learns_every: steps from one update to the next.
     """
 
     init: Callable[[], PyTree]
     store: Callable[[PyTree, Array, Transition, Array, Array | bool], PyTree]
     batch: Callable[[Array, PyTree, Array, Transition, Array | None], PyTree]
-    mask: Callable[[PyTree, Array | bool], PyTree] = lambda batch, active: batch
+    learns_every: int = 1
 
 
 # `(example, max_steps) -> Buffer`: for transitions like `example`, of which there are at most
@@ -145,10 +128,8 @@ def rollout_buffer(length: int) -> BufferMaker:
             store=lambda rows, step, transition, ended, active: write_row(
                 rows, step, jnp.append(pack(transition), jnp.float32(ended)), active
             ),
-            batch=lambda key, rows, num_steps, transition, in_use: Rollout(
-                rows=rows, is_full=num_steps % length == 0
-            ),
-            mask=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
+            batch=lambda key, rows, num_steps, transition, in_use: Rollout(rows),
+            learns_every=length,
         )
 
     return make

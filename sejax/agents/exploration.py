@@ -11,7 +11,6 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -242,19 +241,14 @@ class Curious:
         return state.hparams.reward_scale * jax.lax.stop_gradient(error)
 
     def update(self, key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
+        augmented: Transition | Rollout
         if isinstance(batch, Rollout):
-            # The agent's update is inside: its rows with the bonus would else be made in each step.
-            learn = functools.partial(self.learn, key, rollout=batch)
-            return batch.learn_if_full(learn, state)
-        state = self.train(state, batch)
-        batch = batch._replace(reward=batch.reward + self.bonus(state, batch))
-        return state.replace(agent_state=self.agent.update(key, state.agent_state, batch))
-
-    def learn(self, key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
-        """A learning phase from a full rollout."""
-        batch = rollout.transitions(self.obs_dim, self.is_discrete)
-        augmented = rollout.with_bonus(self.bonus(state, batch))
-        state = self.train(state, batch)
+            steps = batch.transitions(self.obs_dim, self.is_discrete)
+            augmented = batch.with_bonus(self.bonus(state, steps))
+            state = self.train(state, steps)
+        else:
+            state = self.train(state, batch)
+            augmented = batch._replace(reward=batch.reward + self.bonus(state, batch))
         return state.replace(agent_state=self.agent.update(key, state.agent_state, augmented))
 
 

@@ -29,10 +29,12 @@ from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
+from sejax.ops import cpu
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
+    LARGEST,
     MOST_LAYERS,
     MOVES,
     counts,
@@ -145,7 +147,14 @@ class PPOConfig(AgentOptions):
 
     def spec(self) -> AgentSpec:
         # It learns from the start; `warmup_episodes` only holds back the stop rule.
-        return dataclasses.replace(super().spec(), learns_from=0, action_repeat=self.action_repeat)
+        minibatch = (self.rollout_steps or LARGEST) // self.num_minibatches
+        is_small = self.hidden_size * minibatch <= cpu.SMALL_PRODUCT
+        return dataclasses.replace(
+            super().spec(),
+            learns_from=0,
+            action_repeat=self.action_repeat,
+            cpu_num_parallel=cpu.SMALL_NUM_PARALLEL if is_small else 1,
+        )
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam's direction, of a gradient that may be shortened first."""
@@ -183,8 +192,7 @@ class Batch(NamedTuple):
 class PPO(Learner):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    `update` learns once the rollout is full and costs next to nothing before, under `vmap` too. A
-    tree of parameters has the keys actor, whose outputs are logits, critic and std.
+    Parameters have the keys actor, whose outputs are logits, critic and std.
 
     Args:
       config: hyperparameters.
@@ -263,15 +271,31 @@ class PPO(Learner):
         return log_prob, entropy, self.value(params, obs)
 
     def update(self, key: Array, state: PPOState, batch: Rollout) -> PPOState:
-        """A learning phase where the rollout is full, and else nothing."""
+        """A learning phase.
 
-        def phase(state: PPOState) -> PPOState:
-            # XLA would move what does not depend on the carry out of the loop, into every step.
-            inputs = (key, state.params, batch.rows)
-            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
-            return self.learn(phase_key, state.replace(params=params), batch._replace(rows=rows))
+        It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
+        steps. A rollout that these do not divide leaves some steps out of each pass.
+        """
+        config, hp = self.config, state.hparams
+        steps = batch.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
+        rollout, return_sums = self.prepared(state, steps, batch.ended)
+        order = shuffled(key, config.epochs, config.num_minibatches, rollout.returns.size)
 
-        return batch.learn_if_full(phase, state)
+        def adam_step(number: Array, carry: Moved) -> Moved:
+            params, opt_state = carry
+            minibatch = rollout
+            if config.num_minibatches > 1:
+                minibatch = jax.tree.map(lambda x: x[..., order[number]], rollout)
+            gradient = jax.grad(self.loss)(params, minibatch, hp)
+            directions, opt_state = self.optimizer.update(gradient, opt_state)
+            params = jax.tree.map(lambda x, dx: x - hp.learning_rate * dx, params, directions)
+            return params | {"std": jnp.maximum(params["std"], MIN_STD)}, opt_state
+
+        num_updates = config.epochs * config.num_minibatches
+        params, opt_state = jax.lax.fori_loop(
+            0, num_updates, adam_step, (state.params, state.opt_state)
+        )
+        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
     def prepared(
         self, state: PPOState, steps: Transition, ended: Steps
@@ -310,33 +334,6 @@ class PPO(Learner):
         delta = reward + decay * self.value(params, steps.next_obs) - value
         advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
         return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
-
-    def learn(self, key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        """A learning phase.
-
-        It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
-        steps. A rollout that these do not divide leaves some steps out of each pass.
-        """
-        config, hp = self.config, state.hparams
-        steps = rollout.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
-        batch, return_sums = self.prepared(state, steps, rollout.ended)
-        order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
-
-        def adam_step(number: Array, carry: Moved) -> Moved:
-            params, opt_state = carry
-            minibatch = batch
-            if config.num_minibatches > 1:
-                minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
-            gradient = jax.grad(self.loss)(params, minibatch, hp)
-            directions, opt_state = self.optimizer.update(gradient, opt_state)
-            params = jax.tree.map(lambda x, dx: x - hp.learning_rate * dx, params, directions)
-            return params | {"std": jnp.maximum(params["std"], MIN_STD)}, opt_state
-
-        num_updates = config.epochs * config.num_minibatches
-        params, opt_state = jax.lax.fori_loop(
-            0, num_updates, adam_step, (state.params, state.opt_state)
-        )
-        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
     def loss(self, params: PyTree, batch: Batch, hp: Hparams) -> Float[Array, ""]:
         r"""What a learning phase minimises.

@@ -161,9 +161,9 @@ def map_in_batches(
     # result must not depend on how many elements a device has.
     num_batches = -(-size // width)
     indices = np.arange(num_batches * width) % size
-    batches = jax.tree.map(lambda x: x[indices].reshape(-1, width, *x.shape[1:]), args)
+    batches = jax.tree.map(lambda x: x[indices].reshape(num_batches, width, *x.shape[1:]), args)
     out = jax.lax.map(jax.vmap(lambda args: fn(*args)), batches)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
+    return jax.tree.map(lambda x: x.reshape(num_batches * width, *x.shape[2:])[:size], out)
 
 
 def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., T]:
