@@ -11,7 +11,7 @@ from support import assert_close, bits, numpy_forward, paper_se, refused
 from sejax import envs
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.base import episode_limit, is_real
+from sejax.proxies.base import is_real
 from sejax.proxies.synthetic import SyntheticConfig, SyntheticState
 
 CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
@@ -288,14 +288,14 @@ def test_horizons_and_least_numbers_of_steps(config, outputs, terminated, trunca
     np.testing.assert_array_equal(walked[1], truncated)  # as in sejax.gym
     np.testing.assert_allclose(walked[2], discounts)
     limit = config.get("horizon", 200)
-    assert not is_real(env) and episode_limit(env) == limit
+    assert not is_real(env) and env.max_steps == limit
     assert env.default_params.max_steps_in_episode == limit
 
 
 def test_a_bandit_has_a_reward_and_nothing_else():
     env = make_env(horizon=1)
     weights = env.init_weights(jax.random.key(4))
-    assert set(weights) == {"reward"} and episode_limit(env) == 1
+    assert set(weights) == {"reward"} and env.max_steps == 1
     params = env.params(weights)
     start, state = env.reset_env(jax.random.key(0), params)
     real, _ = env.task.env.reset_env(jax.random.key(0), env.task.params)
@@ -342,5 +342,5 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
 def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
     assert env.num_actions == 3 and env.observation_space().shape == (6,)
-    assert env.name == "Synthetic-acrobot" and not is_real(env) and episode_limit(env) == 500
+    assert env.name == "Synthetic-acrobot" and not is_real(env) and env.max_steps == 500
     assert make_env("acrobot") is env  # one instance for each configuration

@@ -180,8 +180,6 @@ def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
         return Box(low, high)
-    raise ConfigError(
-        f"env must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}. "
-        "Make them one array in a subclass of sejax.envs.wrappers.Wrapper.",
-        "env",
-    )
+    fix = "Make them one array in a subclass of sejax.envs.wrappers.Wrapper"
+    must = f"must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}"
+    raise ConfigError(f"env {must}. {fix}.", "env")

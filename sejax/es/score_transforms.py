@@ -140,13 +140,10 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         except Exception as error:
             must = f"{FIELD} must be a function of scores [pop] that jax can trace"
             raise ConfigError(f"{must}; {choice} raised {told(error)}.", FIELD) from error
-        require(
-            weights.shape == (pop,) and np.isfinite(weights).all(),
-            FIELD,
-            f"must give a finite weight for each of {pop} scores; got {weights.tolist()!s:.60} of "
-            f"shape {list(weights.shape)} for the scores {scores.tolist()!s:.40}. Mend {choice}, "
-            f"or set {FIELD}=rank.",
-        )
+        is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
+        got = f"got {weights.tolist()!s:.60} of shape {list(weights.shape)} for the scores"
+        must = f"must give a finite weight for each of {pop} scores; {got} {scores.tolist()!s:.40}"
+        require(is_fit, FIELD, f"{must}. Mend {choice}, or set {FIELD}=rank.")
 
     def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
         weights = jnp.asarray(function(_floor_nonfinite(scores)), jnp.float32)

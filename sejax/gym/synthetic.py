@@ -159,9 +159,7 @@ class SyntheticWorld:
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         if known:
             bound = self.action_space.high  # type: ignore[attr-defined]
-            apart = action - bound * np.clip(outputs, -1, 1)
-            cost = np.abs(apart) if self.config.reward_form == "distance" else apart**2
-            outputs = -self.config.reward_slope * cost.sum(axis=-1, keepdims=True)
+            outputs = self.config.distance_reward(action, outputs, bound)[..., None]
         if self.config.is_bandit:
             whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
             whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1

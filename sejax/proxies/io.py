@@ -109,7 +109,7 @@ class Proxy(_Loaded):
 
 def fingerprint(weights: Any) -> str:
     """Eight hexadecimal digits that tell nested weights from others."""
-    flat = _flatten(weights)
+    flat = flatten_dict(weights, sep="/")
     content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
     return hashlib.sha256(content).hexdigest()[:8]
 
@@ -316,12 +316,9 @@ def save_set(
     """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
 
     Raises:
-      ConfigError: as `save`, or if there are not as many records as proxies.
+      ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    got = f"got {len(records)} for {len(weights)}. Set records=[{{}}] * len(weights)"
-    is_fit = len(weights) == len(records) > 0
-    require(is_fit, "records", f"must be one for each proxy; {got}.")
     _write(path, env, weights, records, config, discount, is_set=True)
 
 
@@ -337,13 +334,11 @@ def _write(
     is_known = discount is not None or not env.config.needs_discount
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(is_known, "discount", must)
-    stacked: dict[str, list[np.ndarray]] = {}
-    for nested in weights:
-        tensors = {name: np.asarray(x, np.float32) for name, x in _flatten(nested).items()}
-        check_tensors("weights", tensors, _shapes_of(env), "params.weights")
-        stacked = {name: [*stacked.get(name, []), x] for name, x in tensors.items()}
-    if is_set:
-        tensors = {name: np.stack(arrays) for name, arrays in stacked.items()}
+    stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
+    tensors = flatten_dict(stacked, sep="/")
+    _require_weights("weights", tensors, env, len(records), "params.weights")
+    if not is_set:
+        tensors = {name: x[0] for name, x in tensors.items()}
     known = {"env": env.task.origin or {"name": env.task.name}}
     known["proxy"] = registry.describe("proxy", env.config)
     try:
@@ -366,15 +361,13 @@ def _write(
     write_bytes(Path(path).expanduser(), data)
 
 
-def _flatten(weights: PyTree) -> dict[str, Any]:
-    """Nested weights by `network/layer/parameter`."""
-    return flatten_dict(weights, sep="/")
-
-
-def _shapes_of(env: ProxyEnv) -> dict[str, tuple[int, ...]]:
-    """Shape of each of a proxy's weights."""
+def _require_weights(
+    field: str, tensors: Mapping[str, np.ndarray], env: ProxyEnv, count: int, fix: str
+) -> None:
+    """Checks the tensors of so many proxies, by `network/layer/parameter`."""
     weights = jax.eval_shape(env.init_weights, jax.random.key(0))
-    return {name: x.shape for name, x in _flatten(weights).items()}
+    shapes = {name: (count, *x.shape) for name, x in flatten_dict(weights, sep="/").items()}
+    check_tensors(field, tensors, shapes, fix)
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -468,8 +461,8 @@ def _proxies_of(
     path, tensors, learned = stored
     if not learned.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    shapes = {name: (len(learned.proxies), *shape) for name, shape in _shapes_of(env).items()}
-    check_tensors(option, tensors, shapes, "a file that sejax has written")
+    fix = "a file that sejax has written"
+    _require_weights(option, tensors, env, len(learned.proxies), fix)
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),
@@ -483,8 +476,7 @@ def _proxies_of(
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
     learned, where = stored.header, stored.path.name
-    if proxy is None:
-        proxy = header.configured("proxy", learned.config["proxy"], where)
+    proxy = proxy or header.configured("proxy", learned.config["proxy"], where)
     real = task
     if real is None:
         try:
@@ -499,8 +491,7 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
     require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
     if task is not None:
         _require_same(learned, task, proxy, where)
-    env: ProxyEnv = registry.make("proxy", proxy, real)
-    return env
+    return registry.make("proxy", proxy, real)
 
 
 def _require_same(learned: Header, task: Task, proxy: ProxyConfig, where: str) -> None:

@@ -152,6 +152,12 @@ class SyntheticConfig(ProxyConfig):
             networks["start"] = [obs_dim, self.start_hidden_size, obs_dim]
         return networks
 
+    def distance_reward(self, action: Vector, outputs: Vector, bound: float | np.ndarray) -> Any:
+        """Rewards `[*batch]` of actions, by the outputs of such a reward network; NumPy or JAX."""
+        apart = action - bound * outputs.clip(-1.0, 1.0)
+        cost = abs(apart) if self.reward_form == "distance" else apart**2
+        return -self.reward_slope * cost.sum(axis=-1)
+
     def units(self, space: Box) -> Units | None:
         """Units of states in a box; None for the task's own.
 
@@ -342,9 +348,8 @@ class BanditEnv(SyntheticEnv):
             reward = self._apply(weights, "reward", self._inputs(vector, action))
             return vector, reward[0], jnp.float32(1)
         best = self._apply(weights, "reward", self._seen(vector))
-        apart = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
-        cost = jnp.abs(apart) if self.config.reward_form == "distance" else apart**2
-        return vector, -self.config.reward_slope * cost.sum(), jnp.float32(1)
+        reward = self.config.distance_reward(action, best, self.task.max_action)
+        return vector, reward, jnp.float32(1)
 
     def bandit_reward(
         self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array

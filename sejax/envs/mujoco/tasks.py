@@ -99,11 +99,9 @@ class HalfCheetah(MujocoTask):
 
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
-            raise ConfigError(
-                f"env.backend must be mujoco without brax; got {self.backend} ({error}). "
-                "Install brax with pip install 'sejax[brax]'.",
-                "env.backend",
-            ) from error
+            fix = f"got {self.backend} ({error}). Install it with pip install 'sejax[brax]'"
+            message = f"env.backend must be mujoco without brax; {fix}."
+            raise ConfigError(message, "env.backend") from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
