@@ -52,7 +52,7 @@ class SyntheticWorld:
         self.config = config
         self.action_space = task.action_space
         self.max_steps = config.max_steps(task.max_steps)
-        self.draws_ends = config.done in ("bernoulli", "sigmoid") and not config.is_bandit
+        self.draws_ends = config.done == "bernoulli" and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
         observation = space_of(task.observation_space, "task.observation_space")
         action_dim = space_of(task.action_space, "task.action_space").size
@@ -136,10 +136,10 @@ class SyntheticWorld:
             reward, done = reward.item(), done.item()
         at_limit = time >= self.max_steps
         may_end = (time >= self.config.min_steps) | absurd
-        terminated = self._ends(done, chance) & may_end | absurd
+        terminated = (chance < done if self.draws_ends else done > 0.5) & may_end | absurd
         discount = 1 - (done * may_end if self.config.done == "soft" else terminated)
         truncated = at_limit
-        if self.config.ends_at_horizon:
+        if self.config.horizon is not None:
             terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
         return outputs[..., :-2], reward, terminated, truncated, discount
@@ -159,7 +159,7 @@ class SyntheticWorld:
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         if known:
             bound = self.action_space.high  # type: ignore[attr-defined]
-            outputs = self.config.distance_reward(action, outputs, bound)[..., None]
+            outputs = -np.abs(action - bound * np.clip(outputs, -1, 1)).sum(-1, keepdims=True)
         if self.config.is_bandit:
             whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
             whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1
@@ -167,13 +167,6 @@ class SyntheticWorld:
         if self._units is not None:
             outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
-
-    def _ends(self, done: Any, chance: Any) -> Any:
-        """Whether the done output ends the episode."""
-        if not self.draws_ends:
-            return done > 0.5
-        is_logit = self.config.done == "sigmoid"
-        return chance < ((1 + np.tanh(done / 2)) / 2 if is_logit else done)
 
 
 class SyntheticEnv(gymnasium.Env[Any, Any]):
@@ -183,8 +176,8 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     real one does; or, for tasks of discrete states, the index of the state vector's largest entry.
 
     An episode is *terminated* where the done output d says so (`config.done`), at the step
-    `config.min_steps` at the earliest; where a learned horizon ends it (`config.horizon`, unless it
-    merely cuts); or where an output is not finite or beyond 1e6, which also costs the step its
+    `config.min_steps` at the earliest; where its horizon ends it (`config.horizon`); or where an
+    output is not finite or beyond 1e6, which also costs the step its
     reward and leaves the state where it was. It is *truncated* at the task's step limit, here and
     not by a wrapper. `info["discount"]` is what the agents that an SE was learned with bootstrap
     with: 0 where the episode has terminated and 1 elsewhere, save in an SE with `done=soft`, where
