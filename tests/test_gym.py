@@ -51,7 +51,8 @@ def stored(tmp_path):
 
 def world_of(task="cartpole", max_steps=4, outputs=None, **config):
     """An SE of random weights, or of constant outputs, whatever it sees."""
-    task = RealTask.of_gymnasium(sejax.gym.GYMNASIUM_IDS[task], max_steps)
+    real = gymnasium.make(sejax.gym.GYMNASIUM_IDS[task], max_episode_steps=max_steps)
+    task = RealTask.of_env(real)
     config = paper_se(**SMALL | {"done": "threshold"} | config)
     units = config.networks(*map(spaces.flatdim, (task.observation_space, task.action_space)))
     like = {k: np.zeros(shape) for k, shape in sejax.gym.networks.shapes_of(units).items()}
@@ -423,7 +424,7 @@ def test_an_unknown_task_must_be_given(stored):
     for given in ("CartPole-v1", other):
         assert refused(make, path, given) == "task"
     images = dataclasses.replace(mine, observation_space=spaces.Box(0, 1, (2, 2)))
-    assert refused(make, path, images) == "task.observation_space"
+    assert refused(make, path, images) == "weights"
 
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
@@ -440,7 +441,7 @@ def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
 
 
 def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    path, task = stored(jax_se()), RealTask.of_gymnasium("CartPole-v1")
+    path, task = stored(jax_se()), RealTask.of_env(gymnasium.make("CartPole-v1"))
     assert refused(make, path, task) == "task"
     for given in (None, "CartPole-v1", dataclasses.replace(task, max_steps=200)):
         assert make(path, given).world.max_steps == 200

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from sejax import envs
 from sejax.gym import networks
-from sejax.gym.tasks import Env, Info, RealTask, space_of
+from sejax.gym.tasks import Env, Info, RealTask
 from sejax.options import as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, read
@@ -64,8 +64,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         fraction()("discount", discount, header.discount)
         self.discount = float(discount)
         self._info_keys = self._keys(header)
-        num_inputs = space_of(env.observation_space, "env.observation_space").size
         _require_task(env, header)
+        num_inputs = flatdim(env.observation_space)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
         shapes = networks.shapes_of({"potential": [num_inputs + num_keys, *hidden, 1]})
@@ -153,6 +153,6 @@ def _require_task(env: Env, header: Header) -> None:
     require(is_same, "env", f"{must}; got {shortened(env)}.")
 
 
-def _kind(space: Space[Any]) -> tuple[type, int]:
+def _kind(space: Space[Any]) -> tuple[object, ...]:
     """What must be equal for two spaces to be of one task."""
-    return type(space), flatdim(space)
+    return type(space), space.shape, flatdim(space)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from sejax.envs.spec import Box
 from sejax.gym import networks
-from sejax.gym.tasks import Info, RealTask, space_of
+from sejax.gym.tasks import Info, RealTask
 from sejax.options import one_of, require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import check_tensors
@@ -54,12 +54,11 @@ class SyntheticWorld:
         self.max_steps = config.max_steps(task.max_steps)
         self.draws_ends = config.done == "bernoulli" and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
-        observation = space_of(task.observation_space, "task.observation_space")
-        action_dim = space_of(task.action_space, "task.action_space").size
-        self.obs_dim = observation.size
         self.observation_space, self._units = task.observation_space, None
-        if isinstance(observation, Box):
-            self._units = config.units(observation)
+        self.obs_dim, action_dim = map(spaces.flatdim, (task.observation_space, task.action_space))
+        if isinstance(task.observation_space, spaces.Box):
+            bounds = task.observation_space.low, task.observation_space.high
+            self._units = config.units(Box(*map(tuple, bounds)))
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
         units = config.networks(self.obs_dim, action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")

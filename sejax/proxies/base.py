@@ -54,11 +54,6 @@ class ProxyConfig(Options, ABC):
         return False
 
     @property
-    def sees_bounds(self) -> bool:
-        """Whether the bounds of the task's observations are part of the proxy."""
-        return False
-
-    @property
     def reaches_step_limit(self) -> bool:
         """Whether episodes of nearly all proxies of this kind last to their step limit."""
         return False

@@ -107,13 +107,6 @@ def _sizes_of(space: Space) -> list[int]:
     return [space.size * are_bounds]
 
 
-def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
-    """Whether two spaces are the same but for rounding."""
-    if not (isinstance(one, Box) and isinstance(other, Box) and one.size == other.size):
-        return one == other
-    return not with_bounds or np.allclose([one.low, one.high], [other.low, other.high])
-
-
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Plain values of a configuration's agent, or of its mixture of agents, by their keys."""
     agent, mixture = config.get("agent"), config.get("agents")

@@ -101,10 +101,6 @@ class SyntheticConfig(ProxyConfig):
     def needs_task(self) -> bool:
         return self.initial_state == "real"
 
-    @property
-    def sees_bounds(self) -> bool:
-        return self.state_units == "bounds"
-
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that the reward's form is one for the task's actions.
 
