@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sejax import options
-from sejax.envs.environment import Environment, EnvParams
+from sejax.envs.environment import Environment, EnvParams, spaces_of
 from sejax.envs.spec import Space, TaskSpec
 from sejax.envs.wrappers import as_vectors
 
@@ -82,7 +82,8 @@ class Task(TaskSpec):
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)
-            vectors, observation, action = as_vectors(env, params)
+            vectors = as_vectors(env, params)
+            observation, action = spaces_of(vectors, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # seconds for some, which have their own tests
         vars(self).update(

@@ -189,15 +189,15 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
         return jnp.ravel(obs).astype(jnp.float32)
 
 
-def as_vectors(env: Environment, params: EnvParams) -> tuple[Environment, Space, Space]:
-    """An environment as agents can take it, itself or in `AsVectors`, and its spaces.
+def as_vectors(env: Environment, params: EnvParams) -> Environment:
+    """An environment as agents can take it, itself or in `AsVectors`.
 
     Raises:
       ConfigError: for spaces other than boxes and discrete ones, or actions without bounds.
     """
     observation, action = spaces_of(env, params)
     if isinstance(env, Environment) and env.spaces is not None:
-        return env, observation, action
+        return env
     shape = env.action_space(params).shape
     has_plain_obs = isinstance(observation, Discrete)
     if not has_plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
@@ -210,6 +210,5 @@ def as_vectors(env: Environment, params: EnvParams) -> tuple[Environment, Space,
         require(is_bounded, "env", f"must have bounded actions; {fix}.")
         is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # from the same -x to x
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
-        return env, observation, action
-    vectors = AsVectors(env, (observation, action), shape)
-    return vectors, *spaces_of(vectors)
+        return env
+    return AsVectors(env, (observation, action), shape)
