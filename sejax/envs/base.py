@@ -86,14 +86,9 @@ class Task(TaskSpec):
             observation, action = spaces_of(vectors, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # seconds for some, which have their own tests
-        vars(self).update(
-            env=vectors,
-            params=params,
-            observation=observation,
-            action=action,
-            max_steps=int(max_steps),
-            solved_reward=solved_reward,
-        )
+        known = {"env": vectors, "params": params, "max_steps": int(max_steps)}
+        known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
+        vars(self).update(known)
 
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":

@@ -35,11 +35,9 @@ GYMNASIUM_IDS = {
     "reacher": "Reacher-v5",
 }
 GRIDS = ("cliff_walking", "gridworld_2x2")
-GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
 
 Env = gymnasium.Env[Any, Any]
 Info = dict[str, Any]  # of a reset or a step; and what a reset is told
-Starts = Callable[[np.random.Generator], Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +56,7 @@ class RealTask:
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
     max_steps: int
-    starts: Starts | None = None
+    starts: Callable[[np.random.Generator], Any] | None = None
 
     @classmethod
     def of_spec(cls, spec: TaskSpec) -> "RealTask":
@@ -106,7 +104,7 @@ def real_env(header: Header, **options: Any) -> Env:
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
-    is_known &= fields.pop("backend", "mujoco") in GYMNASIUM_BACKENDS
+    is_known &= fields.pop("backend", "mujoco") != "spring"  # whose dynamics are others
     must = "must be given, because Gymnasium has none that is the same"
     fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
     require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")

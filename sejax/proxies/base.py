@@ -85,7 +85,6 @@ class ProxyParams(EnvParams):
     """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
-    max_steps_in_episode: int = 1
 
 
 class ProxyEnv(Environment, ABC):

@@ -256,8 +256,6 @@ def budget_for(
     max_steps = training.max_steps
     if max_steps is None:
         return training
-    if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
-        max_steps = min(max_steps, training.max_episodes * max_episode_steps)
     limits = max_episode_steps, task_max_steps
     waited = max((x.steps_before_learning(*limits) for x in learned_with), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)

@@ -166,7 +166,6 @@ class SyntheticConfig(ProxyConfig):
 @struct.dataclass
 class SyntheticState(EnvState):
     vector: Array  # [obs_dim]: what the networks see and predict
-    time: Array | int
 
 
 class SyntheticEnv(ProxyEnv):
