@@ -82,7 +82,6 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
     if text.endswith(".zip"):
         return _checked(_of_sb3(text, task), task)
     require(":" in text, "policy", f"must be a model or a function; got {shortened(text)}. {FIX}")
-    registry.require_path("policy", text)
     return _checked(registry.imported("policy", text), task)
 
 

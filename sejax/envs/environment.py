@@ -130,13 +130,11 @@ class Environment(Generic[State, Params]):
 
     def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
-        assert self.spaces is not None
-        return _as_gymnax(self.spaces[0])
+        return _as_gymnax(spaces_of(self)[0])
 
     def action_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
-        assert self.spaces is not None
-        return _as_gymnax(self.spaces[1])
+        return _as_gymnax(spaces_of(self)[1])
 
     @property
     def num_actions(self) -> int:

@@ -60,5 +60,7 @@ class GymnaxTask(Options):
         solved = self.solved_reward
         if solved is None:
             solved = SOLVED_REWARD.get(gymnax_id, math.inf)
-        limits = {"solved_reward": solved, "max_steps": self.max_steps}
-        return Task(name=self.name, env=env, params=params, **limits)
+        max_steps = self.max_steps or params.max_steps_in_episode
+        return Task(
+            name=self.name, env=env, params=params, solved_reward=solved, max_steps=max_steps
+        )

@@ -141,13 +141,11 @@ def _require_task(env: Env, header: Header) -> None:
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    # Wrappers may make actions of one kind of another: some layer has the task's.
-    action_kinds = [_kind(layer.action_space) for layer in layers]
     must = f"must be sejax's {shortened(header.task, 40)}, its observations changed by no wrapper"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, whose rules are others
         and _kind(env.observation_space) == _kind(learned.observation_space)
-        and _kind(learned.action_space) in action_kinds
+        and _kind(env.unwrapped.action_space) == _kind(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
     )
     require(is_same, "env", f"{must}; got {shortened(env)}.")

@@ -89,7 +89,7 @@ class SyntheticWorld:
         vector = vector if self._units is None else self._units.decode(vector)
         return np.minimum(np.maximum(vector, -LIMIT), LIMIT)
 
-    def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
+    def encode(self, action: ArrayLike, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
 
         Args:

@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from sejax.envs.base import Task
 from sejax.options import require
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig
+from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig, Vector
 
 Layer = tuple[np.ndarray, np.ndarray]  # kernel [out, in] and bias [out] of an affine map
 
@@ -164,7 +164,7 @@ def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     return weights
 
 
-def evaluate(layers: Sequence[Layer], inputs: Any) -> Any:
+def evaluate(layers: Sequence[Layer], inputs: Vector) -> Vector:
     """The policy's outputs `[state, action_dim]` for states `[state, obs_dim]`, before clipping.
 
     Of NumPy or JAX.

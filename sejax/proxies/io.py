@@ -107,7 +107,7 @@ class Proxy(_Loaded):
         return fingerprint(self.params.weights)
 
 
-def fingerprint(weights: Any) -> str:
+def fingerprint(weights: PyTree) -> str:
     """Eight hexadecimal digits that tell nested weights from others."""
     flat = flatten_dict(weights, sep="/")
     content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
@@ -131,7 +131,7 @@ class ProxySet(_Loaded):
       path: the file.
     """
 
-    weights: Any
+    weights: PyTree
     records: tuple[dict[str, Any], ...]
 
     def __len__(self) -> int:
@@ -305,7 +305,7 @@ def save(
 def save_set(
     path: str | Path,
     env: ProxyEnv,
-    weights: Sequence[Any],
+    weights: Sequence[PyTree],
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None = None,
     discount: float | None = None,
@@ -322,7 +322,7 @@ def save_set(
 def _write(
     path: str | Path,
     env: ProxyEnv,
-    weights: Sequence[Any],
+    weights: Sequence[PyTree],
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None,
     discount: float | None,

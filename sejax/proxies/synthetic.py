@@ -287,7 +287,7 @@ class SyntheticEnv(ProxyEnv):
             return jax.random.uniform(key) < done  # in [0, 1): never for d <= 0, always for d >= 1
         return done > 0.5
 
-    def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Any:
+    def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Array:
         """Whether the episode is at its limit, unless that terminates it."""
         if self.config.horizon is not None:
             return jnp.bool_(False)
