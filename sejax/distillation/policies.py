@@ -155,13 +155,13 @@ def copied(
     started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
     key, key_visit, _, key_fit = jax.random.split(key, 4)
-    own_states, policy_return = visit(task, act, key_visit, config.episodes)
-    scale = own_states.mean(0), np.maximum(own_states.std(0), 1e-2)
-    states, actions = own_states, act(own_states)
+    policy_states, policy_return = visit(task, act, key_visit, config.episodes)
+    scale = policy_states.mean(0), np.maximum(policy_states.std(0), 1e-2)
+    states, actions = policy_states, act(policy_states)
     layers = fit(config, task, states, actions, scale, key_fit)
     for _ in range(config.rounds - 1):
         key, key_visit, key_error, key_fit = jax.random.split(key, 4)
-        rough = erring(task, layers, own_states, key_error, config.episodes)
+        rough = erring(task, layers, policy_states, key_error, config.episodes)
         visited, _ = visit(task, rough, key_visit, config.episodes)
         states = np.concatenate([states, visited])
         actions = np.concatenate([actions, act(visited)])
@@ -171,7 +171,7 @@ def copied(
     agent_steps = config.agent_steps * registry.is_registered("agent", policy)
     real_steps = len(states) + len(tested) + agent_steps
     costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
-    return [Lesson(0, layers, own_states, policy_return)], pd.DataFrame(costs)
+    return [Lesson(0, layers, policy_states, policy_return)], pd.DataFrame(costs)
 
 
 def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:

@@ -286,15 +286,15 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         rewards, terminated, truncated, discounts = self.advance(actions)
         self.begin(self._ended)
         ended = terminated | truncated
-        infos = _told(discounts, on)
+        infos = _infos(discounts, on)
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._ended = ended
         elif ended.any():
             obs, final_obs = self.observe(), np.full(self.num_envs, None)
             for i in np.flatnonzero(ended):
                 final_obs[i] = obs[i]
-            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
+            infos = {"final_obs": final_obs, "final_info": _infos(discounts, ended)}
+            infos |= {"_final_obs": ended, "_final_info": ended} | _infos(discounts, ~ended)
             self.begin(ended)
         return self.observe(), rewards, terminated, truncated, infos
 
@@ -341,6 +341,6 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._times *= ~mask
 
 
-def _told(discounts: np.ndarray, mask: np.ndarray) -> Info:
+def _infos(discounts: np.ndarray, mask: np.ndarray) -> Info:
     """Discounts of some environments in Gymnasium's form of infos; empty if of none."""
     return {"discount": np.where(mask, discounts, 0.0), "_discount": mask} if mask.any() else {}
