@@ -156,7 +156,7 @@ def describe(se: Se) -> dict[str, Any]:
         "group": se.proxy.fingerprint,
         "seed": se.proxy.record.get("seed", -1),
         "horizon": se.ses.env.max_steps,
-        "at_limit": "ends" if config.ends_at_horizon else "cut",
+        "at_limit": "ends" if config.horizon else "cut",
         "done": "-" if config.is_bandit else config.done,
         "initial_state": config.initial_state,
     }

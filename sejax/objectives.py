@@ -122,10 +122,7 @@ class MaxReward(ObjectiveConfig):
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
 
     def make(self, task: Task) -> Objective:
-        objective = Objective(
-            score=lambda outcome: outcome.test_return,
-            scores_are_returns=True,
-        )
+        objective = Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
         if self.first_eval_steps is None:
             return objective
         first, last = self.first_eval_steps, task.max_steps
@@ -164,12 +161,9 @@ class RewardThreshold(ObjectiveConfig):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        require(
-            task.is_solvable,
-            "objective",
-            "must need no threshold where the task has none; got reward_threshold. Set "
-            "env.solved_reward, or objective=max_reward.",
-        )
+        got = "got reward_threshold. Set env.solved_reward, or objective=max_reward"
+        must = f"must need no threshold where the task has none; {got}."
+        require(task.is_solvable, "objective", must)
 
         def score(outcome: Outcome) -> Array:
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)

@@ -97,12 +97,9 @@ class Scoring:
             scores of several generations where their units differ.
         """
         has_one_unit = mixture.size == 1 and objective.shown is None
-        require(
-            has_one_unit or not strategy.remembers_scores,
-            "es",
-            "must compare scores within a generation with several agents or a curriculum; got one "
-            "that remembers scores. Set es=nes.",
-        )
+        must = "must compare scores within a generation with several agents or a curriculum"
+        message = f"{must}; got one that remembers scores. Set es=nes."
+        require(has_one_unit or not strategy.remembers_scores, "es", message)
         num_evals = mixture.num_evals(strategy.evaluations.num_incumbent_evals)
         return cls(
             objective=objective,

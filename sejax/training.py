@@ -35,7 +35,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.parts import require_part
-from sejax.proxies.base import episode_limit, is_real, prepare
+from sejax.proxies.base import ProxyEnv, is_real
 
 STOP_RULES = ("plateau", "solved", "never")
 
@@ -277,20 +277,20 @@ class _Loop:
         test_fn: TestFn | None,
         recorder: BufferMaker | None,
     ):
-        episode_steps = episode_limit(env)
         limit_is_terminal = training.time_limit_is_terminal and is_real(env)
         self.agent, self.training, self.solved_reward = agent, training, solved_reward
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
         self.env = repeat_actions(env, agent.spec.action_repeat)
         self.max_steps = self.buffer_steps = training.max_steps or LARGEST
-        if episode_steps is not None:
-            require_reachable("training", training, episode_steps)
-            self.buffer_steps = min(self.max_steps, training.max_episodes * episode_steps)
+        self.prepare = lambda params, hparams: params
+        if isinstance(env, ProxyEnv):
+            require_reachable("training", training, env.max_steps)
+            self.buffer_steps = min(self.max_steps, training.max_episodes * env.max_steps)
+            self.prepare = lambda params, hparams: env.prepare(
+                params, agent.discount(hparams), limit_is_terminal
+            )
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
-        self.prepare = lambda params, hparams: prepare(
-            env, params, agent.discount(hparams), limit_is_terminal
-        )
 
     def train(
         self,

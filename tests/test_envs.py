@@ -14,10 +14,8 @@ from support import assert_close, assert_equal, refused
 
 from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2, GridParams, GridWorld
-from sejax.gym import GYMNASIUM_IDS
-from sejax.gym.tasks import space_of
+from sejax.gym import GYMNASIUM_IDS, RealTask
 from sejax.options import ConfigError, registry
-from sejax.proxies.header import is_same_space
 
 KEY = jax.random.key(0)
 CLASSIC = ["cartpole", "acrobot", "mountain_car", "mountain_car_continuous", "pendulum"]
@@ -142,7 +140,7 @@ def test_limits_thresholds_and_spaces_are_the_papers_and_gymnasiums(name):
     if name in GYMNASIUM_IDS:
         real = gymnasium.make(GYMNASIUM_IDS[name]).unwrapped
         assert real.observation_space.shape == (task.obs_dim,)
-        assert is_same_space(space_of(real.action_space, "task"), task.action)
+        assert real.action_space == RealTask.of_spec(task).action_space
 
 
 # --- the classic tasks, beside Gymnasium and gymnax ----------------------------------------------

@@ -93,14 +93,11 @@ def test_a_number_that_never_varies_is_kept():
     assert 0.25 < moved[1].std() < 0.45
 
 
-@pytest.mark.parametrize("task, layers, states, field", [
-    ("cliff_walking", layers_of(48, 4), STATES, "env"),
-    ("pendulum", layers_of(4, 1), STATES, "policy"),
-    ("pendulum", layers_of(3, 2), STATES, "policy"),
-    ("pendulum", [], STATES, "policy"),
-    ("pendulum", [(np.full((1, 3), np.nan), np.zeros(1))], STATES, "policy"),
-    ("pendulum", layers_of(3, 1), STATES[:, :2], "states"),
-    ("pendulum", layers_of(3, 1), STATES[:1], "states"),
+@pytest.mark.parametrize("task, layers, field", [
+    ("cliff_walking", layers_of(48, 4), "env"),
+    ("pendulum", layers_of(4, 1), "policy"),
+    ("pendulum", layers_of(3, 2), "policy"),
+    ("pendulum", [], "policy"),
 ])  # fmt: skip
-def test_what_does_not_fit_is_refused(task, layers, states, field):
-    assert refused(make_exact, sejax.envs.make(task), layers, states) == field
+def test_what_does_not_fit_is_refused(task, layers, field):
+    assert refused(make_exact, sejax.envs.make(task), layers, STATES) == field

@@ -51,7 +51,8 @@ def stored(tmp_path):
 
 def world_of(task="cartpole", max_steps=4, outputs=None, **config):
     """An SE of random weights, or of constant outputs, whatever it sees."""
-    task = RealTask.of_gymnasium(sejax.gym.GYMNASIUM_IDS[task], max_steps)
+    real = gymnasium.make(sejax.gym.GYMNASIUM_IDS[task], max_episode_steps=max_steps)
+    task = RealTask.of_env(real)
     config = paper_se(**SMALL | {"done": "threshold"} | config)
     units = config.networks(*map(spaces.flatdim, (task.observation_space, task.action_space)))
     like = {k: np.zeros(shape) for k, shape in sejax.gym.networks.shapes_of(units).items()}
@@ -88,11 +89,11 @@ STEPPED = [
     ("cartpole", {"done": "threshold", "state_units": "bounds", "horizon": 2}),
     ("pendulum", {"done": "threshold", "state_units": "bounds", "horizon": 1}),
     ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
-    ("mountain_car_continuous", {"done": "threshold", "horizon": 3, "horizon_is_terminal": False}),
+    ("mountain_car_continuous", {"done": "threshold", "horizon": 3}),
     ("cartpole", BANDIT),
     ("gridworld_2x2", {"done": "soft", "horizon": 1}),
     ("cartpole", {"done": "soft", "min_steps": 3}),
-    ("cartpole", {"done": "sigmoid", "min_steps": 4, "horizon": 6}),
+    ("cartpole", {"done": "bernoulli", "min_steps": 4, "horizon": 6}),
 ]
 
 
@@ -101,7 +102,7 @@ def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
     """All that both say of steps from the same states."""
     jax_env = jax_se(task, **config)
     weights = random_weights(jax_env, scale=1.0)
-    if config["done"] in ("bernoulli", "sigmoid"):  # far out, where any draw says the same
+    if config["done"] == "bernoulli":  # far out, where any draw says the same
         last = weights["done"]["Dense_1"]
         last["kernel"], last["bias"] = 1e3 * last["kernel"], 1e3 * last["bias"]
     env, params = make(stored(jax_env, weights)), jax_env.params(weights)
@@ -121,9 +122,7 @@ def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
         assert_close(reward, expected[2])
         assert_close(info["discount"], expected[4]["discount"])
         assert terminated == expected[3]
-        # At a horizon that terminates gymnax's step says that it truncates too.
-        is_cut = bool(jax_env.is_truncated(expected[1], params))
-        assert truncated == (is_cut and not jax_env.config.ends_at_horizon)
+        assert truncated == bool(jax_env.is_truncated(expected[1], params))
         if terminated or truncated:
             num_ended += 1
             env.reset()
@@ -157,9 +156,9 @@ MODES = ["NextStep", "SameStep"]
 SES = {
     "bandit": {"horizon": 1, "initial_state": "learned"},
     "longer than a block of starts": {"horizon": 2, "initial_state": "noise"},
-    "cut": {"horizon": 3, "horizon_is_terminal": False, "initial_state": "learned"},
+    "cut": {"max_steps": 3, "initial_state": "learned"},
     "drawn ends": {"done": "bernoulli", "initial_state": "learned"},
-    "real starts and drawn ends": {"done": "sigmoid"},
+    "real starts and drawn ends": {"done": "bernoulli"},
     "soft": {"done": "soft"},
     "of a least length": {"done": "soft", "min_steps": 2},
     "continuous actions": {"task": "pendulum", "max_steps": 3, "state_units": "bounds"},
@@ -220,12 +219,9 @@ def test_gymnasium_makes_the_shipped_ones_by_their_names():
 # --- ends ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("mode", "d", "probability"), [("bernoulli", 0.3, 0.3), ("sigmoid", -1.0, 1 / (1 + np.e))]
-)
-def test_ends_are_drawn_with_their_probability(mode, d, probability):
-    count = 2000
-    lanes = env_of(world_of(outputs={"done": d}, done=mode), count)
+def test_ends_are_drawn_with_their_probability():
+    count, probability = 2000, 0.3
+    lanes = env_of(world_of(outputs={"done": probability}, done="bernoulli"), count)
     lanes.reset(seed=0)
     share = lanes.step(np.zeros(count, int))[2].mean()
     assert abs(share - probability) < 5 * (probability * (1 - probability) / count) ** 0.5
@@ -278,7 +274,7 @@ CHECKED = [
     ("cartpole", {"done": "threshold"}),
     ("cartpole", BANDIT),
     ("pendulum", {"done": "bernoulli"}),
-    ("gridworld_2x2", {"done": "sigmoid"}),
+    ("gridworld_2x2", {"done": "bernoulli"}),
 ]
 
 
@@ -428,7 +424,7 @@ def test_an_unknown_task_must_be_given(stored):
     for given in ("CartPole-v1", other):
         assert refused(make, path, given) == "task"
     images = dataclasses.replace(mine, observation_space=spaces.Box(0, 1, (2, 2)))
-    assert refused(make, path, images) == "task.observation_space"
+    assert refused(make, path, images) == "weights"
 
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
@@ -445,7 +441,7 @@ def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
 
 
 def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    path, task = stored(jax_se()), RealTask.of_gymnasium("CartPole-v1")
+    path, task = stored(jax_se()), RealTask.of_env(gymnasium.make("CartPole-v1"))
     assert refused(make, path, task) == "task"
     for given in (None, "CartPole-v1", dataclasses.replace(task, max_steps=200)):
         assert make(path, given).world.max_steps == 200

@@ -15,7 +15,7 @@ from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.options import registry
-from sejax.proxies.base import episode_limit, is_real
+from sejax.proxies.base import is_real
 from sejax.proxies.reward import RewardConfig, RewardEnv
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
@@ -197,8 +197,8 @@ def test_prepared_params_look_up_what_the_network_says():
         for one in (params, prepared):
             np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
     assert prepared.discount == np.float32(GAMMA)
-    assert is_real(env) and episode_limit(env) == 50
-    assert is_real(env.task.env) and episode_limit(env.task.env) is None
+    assert is_real(env) and env.max_steps == 50
+    assert is_real(env.task.env)
     assert make_env("cartpole").prepare(params, GAMMA).potentials is None
 
 

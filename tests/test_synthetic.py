@@ -11,7 +11,7 @@ from support import assert_close, bits, numpy_forward, paper_se, refused
 from sejax import envs
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.base import episode_limit, is_real
+from sejax.proxies.base import is_real
 from sejax.proxies.synthetic import SyntheticConfig, SyntheticState
 
 CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
@@ -23,7 +23,7 @@ def make_env(task="cartpole", **changes):
     return registry.make("proxy", config, envs.make(task))
 
 
-DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
+DONE_MODES = ("soft", "threshold", "bernoulli")
 
 
 @pytest.fixture(scope="module")
@@ -136,29 +136,22 @@ def test_outputs_just_below_absurd_are_a_world(step):
 # --- ends by chance ------------------------------------------------------------------------------
 
 D = np.array([-np.inf, -0.5, 0.0, 0.1, 0.5, 0.9, 1.0, 7.0, np.inf])
-OF_END = {
-    "bernoulli": np.clip(D, 0, 1),
-    # 1 / (1 + exp(-0.5)) = 1 / 1.606531 = 0.622459, and so on.
-    "sigmoid": [0, 0.377541, 0.5, 0.524979, 0.622459, 0.710950, 0.731059, 0.999089, 1],
-}
 
 
-@pytest.mark.parametrize("mode", ["bernoulli", "sigmoid"])
-def test_a_drawn_end_comes_as_often_as_the_done_output_says(mode):
+def test_a_drawn_end_comes_as_often_as_the_done_output_says():
     num_keys = 10_000
-    ends = jax.vmap(jax.vmap(make_env(done=mode).ends, (0, None)), (None, 0))
+    ends = jax.vmap(jax.vmap(make_env(done="bernoulli").ends, (0, None)), (None, 0))
     keys = jax.random.split(jax.random.key(0), num_keys)
     shares = np.asarray(jax.jit(ends)(keys, jnp.float32(D)).mean(axis=1))
-    for share, probability in zip(shares, OF_END[mode], strict=True):
+    for share, probability in zip(shares, np.clip(D, 0, 1), strict=True):
         # The limits are exact, what lies between them is within 5 standard errors.
         error = np.sqrt(probability * (1 - probability) / num_keys)
         assert share == probability if error == 0 else abs(share - probability) < 5 * error
 
 
-@pytest.mark.parametrize(("mode", "done"), [("bernoulli", 0.4), ("sigmoid", -1.0)])
-def test_an_agent_sees_a_drawn_end_as_it_sees_any_other(mode, done):
-    env = make_env(done=mode)
-    params = env.params(constant_heads(env, state=0.7, reward=1.5, done=done))
+def test_an_agent_sees_a_drawn_end_as_it_sees_any_other():
+    env = make_env(done="bernoulli")
+    params = env.params(constant_heads(env, state=0.7, reward=1.5, done=0.4))
     _, state = env.reset_env(jax.random.key(0), params)
     step = jax.jit(jax.vmap(env.step_env, (0, None, None, None)))
     keys = jax.random.split(jax.random.key(1), 50)
@@ -257,7 +250,7 @@ def walk(env, weights, num_steps=3):
 
 
 THRESHOLD, LATE = {"done": "threshold"}, {"min_steps": 3}
-ENDING, CUT = {"horizon": 3}, {"horizon": 3, "horizon_is_terminal": False}
+ENDING = {"horizon": 3}
 NO, LAST = [False] * 3, [False, False, True]
 
 
@@ -266,15 +259,12 @@ NO, LAST = [False] * 3, [False, False, True]
     [
         # d = 0.25 ends nothing. Soft: targets bootstrap with 0.75, at a terminal horizon with 0.
         (ENDING, {"done": 0.25}, LAST, NO, [0.75, 0.75, 0]),
-        (CUT, {"done": 0.25}, NO, LAST, [0.75, 0.75, 0.75]),
         (ENDING | THRESHOLD, {"done": 0.25}, LAST, NO, [1, 1, 0]),
-        (CUT | THRESHOLD, {"done": 0.25}, NO, LAST, [1, 1, 1]),
         (ENDING | THRESHOLD, {"done": 0.6}, [True], [False], [0]),  # before the horizon
         # Steps 1 and 2 end nothing, whatever d says; step 3 is as it would be without min_steps=3.
         (LATE | THRESHOLD, {"done": 1.0}, LAST, NO, [1, 1, 0]),
         (LATE | THRESHOLD, {"done": 0.0}, NO, NO, [1, 1, 1]),
         (LATE | {"done": "bernoulli"}, {"done": 1.0}, LAST, NO, [1, 1, 0]),
-        (LATE | {"done": "sigmoid"}, {"done": 50.0}, LAST, NO, [1, 1, 0]),
         (LATE, {"done": 0.25}, NO, NO, [1, 1, 0.75]),
         (LATE, {"done": 1.5}, LAST, NO, [1, 1, -0.5]),
         (LATE, {"reward": np.nan}, [True], [False], [0]),  # absurd
@@ -288,14 +278,14 @@ def test_horizons_and_least_numbers_of_steps(config, outputs, terminated, trunca
     np.testing.assert_array_equal(walked[1], truncated)  # as in sejax.gym
     np.testing.assert_allclose(walked[2], discounts)
     limit = config.get("horizon", 200)
-    assert not is_real(env) and episode_limit(env) == limit
+    assert not is_real(env) and env.max_steps == limit
     assert env.default_params.max_steps_in_episode == limit
 
 
 def test_a_bandit_has_a_reward_and_nothing_else():
     env = make_env(horizon=1)
     weights = env.init_weights(jax.random.key(4))
-    assert set(weights) == {"reward"} and episode_limit(env) == 1
+    assert set(weights) == {"reward"} and env.max_steps == 1
     params = env.params(weights)
     start, state = env.reset_env(jax.random.key(0), params)
     real, _ = env.task.env.reset_env(jax.random.key(0), env.task.params)
@@ -310,7 +300,7 @@ def test_a_bandit_has_a_reward_and_nothing_else():
 
 @pytest.mark.parametrize("fields", [
     {"done": "maybe"}, {"initial_state": "any"}, {"horizon": 0}, {"min_steps": 0},
-    {"horizon_is_terminal": False, "horizon": 1}, {"min_steps": 4, "horizon": 3},
+    {"min_steps": 4, "horizon": 3},
 ])  # fmt: skip
 def test_what_no_episode_can_be_is_refused(fields):
     assert refused(paper_se, **fields) == f"proxy.{next(iter(fields))}"
@@ -342,5 +332,5 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
 def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
     assert env.num_actions == 3 and env.observation_space().shape == (6,)
-    assert env.name == "Synthetic-acrobot" and not is_real(env) and episode_limit(env) == 500
+    assert env.name == "Synthetic-acrobot" and not is_real(env) and env.max_steps == 500
     assert make_env("acrobot") is env  # one instance for each configuration

@@ -33,7 +33,6 @@ def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
         "solved by": ", ".join(solving) or "none",
         "not by": ", ".join(agent for agent in means if agent not in solving),
         "score": spread([each.return_mean for each in proxy.on_proxy], ".1f"),
-        "steps": spread([each.train_steps for each in proxy.on_proxy], ",.0f"),
         "real steps": f"{proxy.learning.real_steps:,}",
     }
 

@@ -24,20 +24,11 @@ import optax
 import pandas as pd
 from jaxtyping import Array
 
+from sejax import options
 from sejax.agents import make_agent
 from sejax.distillation.policy_search import Lesson, random_map
 from sejax.envs.base import Task
-from sejax.options import (
-    ConfigError,
-    Options,
-    counts,
-    errors_of,
-    option,
-    registry,
-    require,
-    shortened,
-    told,
-)
+from sejax.options import ConfigError, Options, counts, option, registry, require, shortened
 from sejax.proxies.exact import Layer, evaluate, require_vectors
 from sejax.training import TrainingConfig, make_trainer
 
@@ -86,18 +77,12 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
       ConfigError: for anything else; where the policy is called, if it fails, or its actions are
         none of the task.
     """
-    if is_agent(text):
+    if registry.is_registered("agent", text):
         return _of_agent(text, task, agent_steps, key)
     if text.endswith(".zip"):
         return _checked(_of_sb3(text, task), task)
     require(":" in text, "policy", f"must be a model or a function; got {shortened(text)}. {FIX}")
-    registry.require_path("policy", text)
     return _checked(registry.imported("policy", text), task)
-
-
-def is_agent(text: str) -> bool:
-    """Whether an override names an agent of sejax, or of an installed package."""
-    return registry.is_registered("agent", text)
 
 
 def _checked(act: Actor, task: Task) -> Actor:
@@ -110,7 +95,7 @@ def _checked(act: Actor, task: Task) -> Actor:
         try:
             actions = np.asarray(act(obs), float)
         except Exception as error:
-            message = f"policy must act in {task.name}; it raised {told(error)}."
+            message = f"policy must act in {task.name}; it raised {options.told(error)}."
             raise ConfigError(message, "policy") from error
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
         got = f"got {list(actions.shape)}, such as {shortened(actions.ravel()[:3], 40)}"
@@ -128,7 +113,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # whatever lacks where another algorithm looks for it
-        got = f"got {shortened(text)} ({told(error)}). It needs pip install 'sejax[sb3]'"
+        got = f"got {shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
         message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
         raise ConfigError(message, "policy") from error
     # A task whose bounds are not alike everywhere is scaled to [-1, 1].
@@ -139,7 +124,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     """A fresh agent with its default hyperparameters, trained on the real task."""
-    with errors_of("agent", "policy"):  # it may not fit the task
+    with options.errors_of("agent", "policy"):  # it may not fit the task
         agent = make_agent(registry.configure("agent", {"name": name}), task)
     training = TrainingConfig(
         max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
@@ -170,22 +155,23 @@ def copied(
     started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
     key, key_visit, _, key_fit = jax.random.split(key, 4)
-    own_states, policy_return = visit(task, act, key_visit, config.episodes)
-    scale = own_states.mean(0), np.maximum(own_states.std(0), 1e-2)
-    states, actions = own_states, act(own_states)
+    policy_states, policy_return = visit(task, act, key_visit, config.episodes)
+    scale = policy_states.mean(0), np.maximum(policy_states.std(0), 1e-2)
+    states, actions = policy_states, act(policy_states)
     layers = fit(config, task, states, actions, scale, key_fit)
     for _ in range(config.rounds - 1):
         key, key_visit, key_error, key_fit = jax.random.split(key, 4)
-        rough = erring(task, layers, own_states, key_error, config.episodes)
+        rough = erring(task, layers, policy_states, key_error, config.episodes)
         visited, _ = visit(task, rough, key_visit, config.episodes)
         states = np.concatenate([states, visited])
         actions = np.concatenate([actions, act(visited)])
         layers = fit(config, task, states, actions, scale, key_fit)
     tested, copy_return = visit(task, acting(task, layers), key, config.episodes)
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
-    real_steps = len(states) + len(tested) + config.agent_steps * is_agent(policy)
+    agent_steps = config.agent_steps * registry.is_registered("agent", policy)
+    real_steps = len(states) + len(tested) + agent_steps
     costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
-    return [Lesson(0, layers, own_states, policy_return)], pd.DataFrame(costs)
+    return [Lesson(0, layers, policy_states, policy_return)], pd.DataFrame(costs)
 
 
 def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:

@@ -17,7 +17,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,9 @@ from jaxtyping import Array, Float
 
 from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
-from sejax.evaluation import make_recorder, make_tester
+from sejax.evaluation import Steps, Tests, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
+from sejax.ops.scores import or_worst
 from sejax.options import Options, counts, finite, not_negative, option, positive, require
 from sejax.proxies.exact import Layer, require_vectors
 from sejax.runs.store import Store
@@ -124,8 +125,8 @@ class Search(NamedTuple):
 
     init: Callable[[], Policy]
     generation: Callable[[Array, Policy, Array | int], tuple[Policy, Array, Array]]
-    test: Callable[[Array, Policy], Any]
-    record: Callable[[Array, Policy], Any]
+    test: Callable[[Array, Policy], Tests]
+    record: Callable[[Array, Policy], Steps]
 
 
 def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
@@ -187,7 +188,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
             size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
         sizes = jnp.broadcast_to(size, num_episodes)
         returns, num_steps = spread(keys, tried._replace(weights=weights), sizes)
-        plus, minus = jnp.split(_finite(returns - config.alive_bonus * num_steps), 2)
+        plus, minus = jnp.split(or_worst(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
         slope = jnp.tensordot((plus - minus)[top], directions[top], 1)
@@ -196,7 +197,8 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         policy = with_moments(policy._replace(weights=policy.weights + step), seen.obs, seen.valid)
         return policy, returns, num_steps.sum() + seen.valid.sum()
 
-    test, record = (make(agent, task, config.num_tests) for make in (make_tester, make_recorder))
+    test = make_tester(agent, task, config.num_tests)
+    record = make_recorder(agent, task, config.num_tests)
     return Search(init=init, generation=generation, test=test, record=record)
 
 
@@ -215,12 +217,6 @@ def step_size(config: SearchConfig, number: Array | int) -> Array:
     first = config.constant * config.generations
     left = (config.generations - number) / max(config.generations - first, 1.0)
     return config.step_size * jnp.clip(left, 0.1, 1.0)
-
-
-def _finite(returns: Array) -> Array:
-    """Returns of which one that is no number is as bad as the worst."""
-    worst = jnp.min(jnp.where(jnp.isfinite(returns), returns, jnp.inf))
-    return jnp.where(jnp.isfinite(returns), returns, jnp.where(jnp.isfinite(worst), worst, 0.0))
 
 
 def with_moments(policy: Policy, obs: Float[Array, "step obs_dim"], valid: Array) -> Policy:

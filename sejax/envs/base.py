@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sejax import options
-from sejax.envs.environment import Environment, EnvParams
+from sejax.envs.environment import Environment, EnvParams, spaces_of
 from sejax.envs.spec import Space, TaskSpec
 from sejax.envs.wrappers import as_vectors
 
@@ -70,12 +70,10 @@ class Task(TaskSpec):
         params, env, name = self.params, self.env, self.name
         solved_reward = options.as_python(self.solved_reward)
         is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
-        options.require(  # it may be traced
-            not is_nan and not isinstance(solved_reward, str | None),
-            "env.solved_reward",
-            f"must be a number; got {options.shortened(solved_reward)}. Set env.solved_reward=inf "
-            "if it is undefined.",
-        )
+        is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
+        fix = "Set env.solved_reward=inf if it is undefined"
+        must = f"must be a number; got {options.shortened(solved_reward)}. {fix}."
+        options.require(is_known, "env.solved_reward", must)
         with _one_error(name):
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
@@ -84,17 +82,13 @@ class Task(TaskSpec):
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)
-            vectors, observation, action = as_vectors(env, params)
+            vectors = as_vectors(env, params)
+            observation, action = spaces_of(vectors, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # seconds for some, which have their own tests
-        vars(self).update(
-            env=vectors,
-            params=params,
-            observation=observation,
-            action=action,
-            max_steps=int(max_steps),
-            solved_reward=solved_reward,
-        )
+        known = {"env": vectors, "params": params, "max_steps": int(max_steps)}
+        known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
+        vars(self).update(known)
 
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
@@ -113,12 +107,10 @@ def require_own_steps(env: Environment) -> None:
       ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`.
     """
     methods = dir(type(env))
-    options.require(
-        all(f"{name}_env" in methods for name in ("reset", "step") if name in methods),
-        "env",
-        "must change reset_env and step_env in place of reset and step; got "
-        f"{type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper.",
-    )
+    is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
+    fix = f"got {type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper"
+    must = f"must change reset_env and step_env in place of reset and step; {fix}."
+    options.require(is_whole, "env", must)
 
 
 @contextlib.contextmanager
@@ -129,15 +121,11 @@ def _one_error(name: str) -> Iterator[None]:
     except options.ConfigError:
         raise
     except Exception as error:
-        fix = (
-            " Derive it from gymnax's Environment, whose step_env returns obs, state, reward, "
-            "terminated and info, or take it from gymnax.make(ID)[0]."
-        )
-        raise options.ConfigError(
-            f"env must be a gymnax 1.x environment with EnvParams; {name} raised "
-            f"{options.told(error)}.{'' if options.place_of(error) else fix}",
-            "env",
-        ) from error
+        results = "obs, state, reward, terminated and info"
+        fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
+        raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
+        message = f"env must be a gymnax 1.x environment with EnvParams; {raised}"
+        raise options.ConfigError(message, "env") from error
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:
@@ -158,20 +146,17 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         got = {"obs": obs, "next_obs": next_obs, "state": next_state}
         return wanted, got | {"reward": jnp.float32(reward), "terminated": terminated}
 
-    def kinds(tree: PyTree) -> dict[str, str]:
+    def types(tree: PyTree) -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
-    wanted, got = map(kinds, jax.eval_shape(step, jax.random.key(0)))
+    wanted, got = map(types, jax.eval_shape(step, jax.random.key(0)))
     faults = [
         f"{key} is {got.get(key)}, not {wanted.get(key)}"
         for key in wanted | got
         if wanted.get(key) != got.get(key)
     ]
-    options.require(
-        not faults,
-        "env",
-        f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}. "
-        "Cast in reset_env and step_env what differs.",
-    )
+    got_faults = f"got {name}, where {options.shortened('; '.join(faults), 120)}"
+    fix = "Cast in reset_env and step_env what differs"
+    options.require(not faults, "env", f"must keep its shapes; {got_faults}. {fix}.")

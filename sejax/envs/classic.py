@@ -28,9 +28,7 @@ class GymnaxEnv(Wrapper[EnvState, EnvParams]):
         self.env = env
         Environment.__init__(self, spec, env.default_params)
 
-    @property
-    def default_params(self) -> EnvParams:
-        return self._default_params
+    default_params = Environment.default_params
 
     def step_env(
         self, key: Array, state: EnvState, action: Array, params: EnvParams
@@ -102,6 +100,8 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
 
 _NONE = 3.4028234663852886e38  # how CartPole writes that a number has no bound
 _CARTPOLE = Box.symmetric(4.8, _NONE, math.radians(24), _NONE)
+_ACROBOT = Box.symmetric(1.0, 1.0, 1.0, 1.0, 4 * math.pi, 9 * math.pi)
+_PENDULUM, _TORQUE = Box.symmetric(1.0, 1.0, 8.0), Box.symmetric(2.0)
 _CAR = Box(low=(-1.2, -0.07), high=(0.6, 0.07))  # position and velocity
 
 
@@ -147,12 +147,7 @@ class Acrobot(ClassicTask):
 
     name = "acrobot"
     gymnax_id = "Acrobot-v1"
-    spec = TaskSpec(
-        observation=Box.symmetric(1.0, 1.0, 1.0, 1.0, 4 * math.pi, 9 * math.pi),
-        action=Discrete(3),
-        max_steps=500,
-        solved_reward=-100.0,
-    )
+    spec = TaskSpec(observation=_ACROBOT, action=Discrete(3), max_steps=500, solved_reward=-100.0)
 
 
 class MountainCar(ClassicTask):
@@ -185,9 +180,4 @@ class Pendulum(ClassicTask):
 
     name = "pendulum"
     gymnax_id = "Pendulum-v1"
-    spec = TaskSpec(
-        observation=Box.symmetric(1.0, 1.0, 8.0),
-        action=Box.symmetric(2.0),
-        max_steps=200,
-        solved_reward=-250.0,
-    )
+    spec = TaskSpec(observation=_PENDULUM, action=_TORQUE, max_steps=200, solved_reward=-250.0)

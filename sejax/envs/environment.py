@@ -130,13 +130,11 @@ class Environment(Generic[State, Params]):
 
     def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
-        assert self.spaces is not None
-        return _as_gymnax(self.spaces[0])
+        return _as_gymnax(spaces_of(self)[0])
 
     def action_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
-        assert self.spaces is not None
-        return _as_gymnax(self.spaces[1])
+        return _as_gymnax(spaces_of(self)[1])
 
     @property
     def num_actions(self) -> int:
@@ -180,8 +178,6 @@ def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
         return Box(low, high)
-    raise ConfigError(
-        f"env must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}. "
-        "Make them one array in a subclass of sejax.envs.wrappers.Wrapper.",
-        "env",
-    )
+    fix = "Make them one array in a subclass of sejax.envs.wrappers.Wrapper"
+    must = f"must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}"
+    raise ConfigError(f"env {must}. {fix}.", "env")

@@ -3,6 +3,7 @@
 Source: `docs/reference.md` 6.1 and 6.2.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -24,10 +25,7 @@ CLIFF_WALKING = (
     "            ",
     "SOOOOOOOOOOG",
 )
-ROOM_2X2 = (
-    "S ",
-    " G",
-)
+ROOM_2X2 = ("S ", " G")
 
 
 @struct.dataclass
@@ -87,11 +85,9 @@ class GridWorld(Environment[GridState, GridParams]):
         """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
         index = jnp.asarray(self._next)[state.index, action]
         state = GridState(index=index, time=state.time + 1)
-        reward = jnp.where(
-            jnp.asarray(self._goal)[index],
-            params.goal_reward,
-            jnp.where(jnp.asarray(self._hole)[index], params.hole_reward, params.step_reward),
-        )
+        is_hole, is_goal = jnp.asarray(self._hole)[index], jnp.asarray(self._goal)[index]
+        reward = jnp.where(is_hole, params.hole_reward, params.step_reward)
+        reward = jnp.where(is_goal, params.goal_reward, reward)
         return self.after(state, reward, params)
 
     def observe(self, state: GridState) -> Array:
@@ -132,12 +128,8 @@ class CliffWalking(Options):
     goal_reward: float = option(0.0, finite("it is a reward"))
 
     def make(self) -> Task:
-        params = GridParams(
-            step_reward=-1.0,
-            goal_reward=self.goal_reward,
-            hole_reward=-100.0,
-            max_steps_in_episode=self.spec.max_steps,
-        )
+        rewards = GridParams(step_reward=-1.0, goal_reward=self.goal_reward, hole_reward=-100.0)
+        params = dataclasses.replace(rewards, max_steps_in_episode=self.spec.max_steps)
         return Task.of(self.spec, name="cliff_walking", env=GridWorld(CLIFF_WALKING, params))
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from sejax import options
 from sejax.envs.base import Task
-from sejax.options import Options, counts, option
+from sejax.options import Options, counts, option, require, shortened
 
 PREFIX = "gymnax/"
 # Gymnasium's registry defines when these count as solved; it has no threshold for the others.
@@ -41,12 +41,10 @@ class GymnaxTask(Options):
     max_steps: int | None = option(None, counts("an episode has steps"))
 
     def make(self) -> Task:
-        options.require(
-            self.name.startswith(PREFIX),
-            "env",
-            f"must be one of gymnax; got {options.shortened(self.name)}. Other suites are in an "
-            "example now. Set env=other_suites:task in the folder examples/.",
-        )
+        got = f"got {shortened(self.name)}. Other suites are in an example now"
+        fix = "Set env=other_suites:task in the folder examples/"
+        is_gymnax = self.name.startswith(PREFIX)
+        require(is_gymnax, "env", f"must be one of gymnax; {got}. {fix}.")
         import gymnax
         from gymnax.registration import registered_envs
 
@@ -56,11 +54,9 @@ class GymnaxTask(Options):
         try:
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
-            raise options.ConfigError(
-                f"env must be an environment that gymnax can make here; {gymnax_id} raised "
-                f"{options.told(error)}.",
-                "env",
-            ) from error
+            raised = f"{gymnax_id} raised {options.told(error)}"
+            message = f"env must be an environment that gymnax can make here; {raised}."
+            raise options.ConfigError(message, "env") from error
         solved = self.solved_reward
         if solved is None:
             solved = SOLVED_REWARD.get(gymnax_id, math.inf)

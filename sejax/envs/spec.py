@@ -40,10 +40,6 @@ class Box:
         """Length of the vectors."""
         return len(self.high)
 
-    @property
-    def shape(self) -> tuple[int]:
-        return (self.size,)
-
 
 Space = Discrete | Box
 

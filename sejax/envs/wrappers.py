@@ -11,15 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.envs.environment import (
-    Environment,
-    EnvParams,
-    EnvState,
-    Params,
-    State,
-    Step,
-    spaces_of,
-)
+from sejax.envs.environment import Environment, EnvParams, EnvState, Params, State, Step, spaces_of
 from sejax.envs.spec import Box, Discrete, Space
 from sejax.options import require, shortened
 
@@ -50,9 +42,6 @@ class Wrapper(Environment[State, Params]):
 
     def is_truncated(self, state: State, params: Params) -> Array:
         return self.env.is_truncated(state, params)
-
-    def is_terminated(self, state: State, params: Params) -> Array:
-        return self.env.is_terminated(state, params)
 
     def action_space(self, params: Params | None = None) -> "GymnaxSpace":
         return super().action_space() if self.spaces else self.env.action_space(params)
@@ -200,15 +189,15 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
         return jnp.ravel(obs).astype(jnp.float32)
 
 
-def as_vectors(env: Environment, params: EnvParams) -> tuple[Environment, Space, Space]:
-    """An environment as agents can take it, itself or in `AsVectors`, and its spaces.
+def as_vectors(env: Environment, params: EnvParams) -> Environment:
+    """An environment as agents can take it, itself or in `AsVectors`.
 
     Raises:
       ConfigError: for spaces other than boxes and discrete ones, or actions without bounds.
     """
     observation, action = spaces_of(env, params)
     if isinstance(env, Environment) and env.spaces is not None:
-        return env, observation, action
+        return env
     shape = env.action_space(params).shape
     has_plain_obs = isinstance(observation, Discrete)
     if not has_plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
@@ -216,14 +205,10 @@ def as_vectors(env: Environment, params: EnvParams) -> tuple[Environment, Space,
         has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32
     if isinstance(action, Box):
         low, high = np.array(action.low), np.array(action.high)
-        require(
-            np.isfinite([low, high]).all() and (low < high).all(),
-            "env",
-            f"must have bounded actions; got {shortened(action)}. Give its action space a finite "
-            "low and high.",
-        )
+        fix = f"got {shortened(action)}. Give its action space a finite low and high"
+        is_bounded = np.isfinite([low, high]).all() and (low < high).all()
+        require(is_bounded, "env", f"must have bounded actions; {fix}.")
         is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # from the same -x to x
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
-        return env, observation, action
-    vectors = AsVectors(env, (observation, action), shape)
-    return vectors, *spaces_of(vectors)
+        return env
+    return AsVectors(env, (observation, action), shape)

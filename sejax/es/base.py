@@ -133,9 +133,7 @@ class StrategyOptions(Options):
 
     group: ClassVar[str] = "es"
 
-    population_size: int = option(
-        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
-    )
+    population_size: int = option(16, counts("scores are compared", 2, MOST_MEMBERS))
     num_evals: int = option(1, counts("a candidate needs a score"))
     eval_aggregate: str = option("mean", one_of(("mean", "min")))
     common_random_numbers: bool = False

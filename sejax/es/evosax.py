@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sejax.es.base import MAX_SCALE, Evaluations, Strategy, StrategyOptions, StrategyState
-from sejax.options import counts, one_of, option, positive, require, shortened, shrinks
+from sejax.options import counts, one_of, option, positive, require, shrinks
 
 if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
@@ -54,12 +54,8 @@ class EvosaxConfig(StrategyOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.population_size % 2 == 0,
-            "es.population_size",
-            f"must be even; got {shortened(self.population_size)}. Set "
-            f"es.population_size={self.population_size + 1}.",
-        )
+        size, field = self.population_size, "es.population_size"
+        require(size % 2 == 0, field, f"must be even; got {size}. Set {field}={size + 1}.")
 
     def make(self, num_dims: int) -> Strategy:
         """The algorithm over vectors of `num_dims` numbers."""
@@ -80,23 +76,18 @@ class EvosaxConfig(StrategyOptions):
         params = algorithm.default_params
         if self.name != "open_es":
             params = params.replace(std_init=self.noise_std)
+        evaluations = self.evaluations(self.num_incumbent_evals)
+        strategy = from_evosax(algorithm, params, antithetic=antithetic, evaluations=evaluations)
+        if self.name not in ("open_es", "xnes"):
+            return strategy
 
-        def with_std(state: StrategyState) -> StrategyState:
-            """The first state with our std where evosax has another, or another beside it."""
-            if self.name == "open_es":
+        def init(key: Array, mean: Float[Array, " dims"]) -> StrategyState:
+            state = strategy.init(key, mean)
+            if self.name == "open_es":  # which begins with the second generation's std
                 return state.replace(std=state.std / self.noise_std_decay)
-            if self.name == "xnes":  # std_init stands in its shape matrix as well
-                return state.replace(B=state.B / self.noise_std)
-            return state
+            return state.replace(B=state.B / self.noise_std)  # std_init stands in it as well
 
-        strategy = from_evosax(
-            algorithm,
-            params,
-            antithetic=antithetic,
-            evaluations=self.evaluations(self.num_incumbent_evals),
-        )
-        init = strategy.init
-        return dataclasses.replace(strategy, init=lambda key, mean: with_std(init(key, mean)))
+        return dataclasses.replace(strategy, init=init)
 
 
 def from_evosax(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.ops.scores import is_tie, or_lowest
+from sejax.ops.scores import is_tie, or_lowest, or_worst
 from sejax.options import ConfigError, registry, require, told, unknown_name
 
 FIELD = "es.score_transform"
@@ -34,7 +34,7 @@ def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     Returns:
       `[pop]` weights; all 0 if all scores are equal.
     """
-    scores = _floor_nonfinite(scores)
+    scores = or_worst(scores)
     return _safe_divide(scores - scores.min(), scores.max() - scores.min())
 
 
@@ -93,16 +93,9 @@ def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _safe_divide(advantage, advantage.sum())
 
 
-TRANSFORMS: dict[str, ScoreTransform] = {
-    "linear": linear,
-    "rank": rank,
-    "nes": nes,
-    "nes_unnormalized": nes_unnormalized,
-    "single_best": single_best,
-    "single_better": single_better,
-    "all_better_1": all_better_1,
-    "all_better_2": all_better_2,
-}
+_BY_RANK = (linear, rank, nes, nes_unnormalized)
+_BY_ADVANTAGE = (single_best, single_better, all_better_1, all_better_2)
+TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY_ADVANTAGE)}
 
 
 def require_transform(field: str, choice: object, default: object = None) -> None:
@@ -140,16 +133,13 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         except Exception as error:
             must = f"{FIELD} must be a function of scores [pop] that jax can trace"
             raise ConfigError(f"{must}; {choice} raised {told(error)}.", FIELD) from error
-        require(
-            weights.shape == (pop,) and np.isfinite(weights).all(),
-            FIELD,
-            f"must give a finite weight for each of {pop} scores; got {weights.tolist()!s:.60} of "
-            f"shape {list(weights.shape)} for the scores {scores.tolist()!s:.40}. Mend {choice}, "
-            f"or set {FIELD}=rank.",
-        )
+        is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
+        got = f"got {weights.tolist()!s:.60} of shape {list(weights.shape)} for the scores"
+        must = f"must give a finite weight for each of {pop} scores; {got} {scores.tolist()!s:.40}"
+        require(is_fit, FIELD, f"{must}. Mend {choice}, or set {FIELD}=rank.")
 
     def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-        weights = jnp.asarray(function(_floor_nonfinite(scores)), jnp.float32)
+        weights = jnp.asarray(function(or_worst(scores)), jnp.float32)
         return jnp.where(jnp.isfinite(weights) & jnp.isfinite(scores).any(), weights, 0.0)
 
     return transform
@@ -160,7 +150,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     Every candidate with a finite score is better than an incumbent without one.
     """
-    finite = _floor_nonfinite(scores)
+    finite = or_worst(scores)
     below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
     floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
     is_better = jnp.isfinite(scores) & ~(jnp.isfinite(incumbent) & is_tie(scores, incumbent))
@@ -179,13 +169,6 @@ def _scaled_utilities(scores: Scores, subtracted: float) -> Scores:
     utilities = _safe_divide(utilities, utilities.sum()) - subtracted
     utilities = jnp.where(ranked.max() > ranked.min(), utilities, 0.0)
     return _safe_divide(utilities, jnp.abs(utilities).max())
-
-
-def _floor_nonfinite(scores: Scores) -> Scores:
-    """Non-finite scores replaced by the worst finite one (by 0 if there is none)."""
-    finite = jnp.isfinite(scores)
-    worst = jnp.min(jnp.where(finite, scores, jnp.inf))
-    return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))
 
 
 def _safe_divide(numerator: Array, denominator: Array) -> Array:

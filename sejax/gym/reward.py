@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from sejax import envs
 from sejax.gym import networks
-from sejax.gym.tasks import Env, Info, RealTask, space_of
+from sejax.gym.tasks import Env, Info, RealTask
 from sejax.options import as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, read
@@ -64,8 +64,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         fraction()("discount", discount, header.discount)
         self.discount = float(discount)
         self._info_keys = self._keys(header)
-        num_inputs = space_of(env.observation_space, "env.observation_space").size
         _require_task(env, header)
+        num_inputs = flatdim(env.observation_space)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
         shapes = networks.shapes_of({"potential": [num_inputs + num_keys, *hidden, 1]})
@@ -94,8 +94,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """
         obs, real_reward, terminated, truncated, info = self.env.step(action)
         real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
-        told = np.array([info[key] for key in self._info_keys], np.float32)
-        reward = bonus = self._bonus(obs, told, terminated)
+        info_values = np.array([info[key] for key in self._info_keys], np.float32)
+        reward = bonus = self._bonus(obs, info_values, terminated)
         if self.config.shaping.is_additive:
             reward += real_reward
         if not (np.isfinite(reward) and abs(bonus) < MAX_ABS_VALUE):
@@ -103,24 +103,24 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info
 
-    def potential(self, obs: Any, told: np.ndarray | tuple[()] = ()) -> float:
-        """Phi of an observation, and of what `info` told of it if it sees that."""
+    def potential(self, obs: Any, info_values: np.ndarray | tuple[()] = ()) -> float:
+        """Phi of an observation, and of the numbers of `info` that the network sees."""
         if self._table is not None:
             return self._table[obs]
         if not self._layers:
             return 0.0
-        return float(self._apply(np.concatenate([obs, told]) if len(told) else obs))
+        return float(self._apply(np.concatenate([obs, info_values]) if len(info_values) else obs))
 
     def _apply(self, inputs: np.ndarray) -> np.ndarray:
         x = np.asarray(inputs, np.float32)
         outputs = networks.forward(self._layers, self.config.activation, x)
         return self.config.output_scale * outputs[..., 0]
 
-    def _bonus(self, obs: Any, told: np.ndarray, terminated: bool) -> float:
+    def _bonus(self, obs: Any, info_values: np.ndarray, terminated: bool) -> float:
         """What a transition is worth beside the real reward."""
         if self._weights is not None:
-            return float(self._weights @ told)
-        before, self._potential = self._potential, self.potential(obs, told)
+            return float(self._weights @ info_values)
+        before, self._potential = self._potential, self.potential(obs, info_values)
         after = 0.0 if terminated and self.config.zero_at_terminal else self._potential
         return self.discount * after - before if self.config.shaping.is_potential_based else after
 
@@ -141,18 +141,16 @@ def _require_task(env: Env, header: Header) -> None:
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    # Wrappers may make actions of one kind of another: some layer has the task's.
-    action_kinds = [_kind(layer.action_space) for layer in layers]
     must = f"must be sejax's {shortened(header.task, 40)}, its observations changed by no wrapper"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, whose rules are others
-        and _kind(env.observation_space) == _kind(learned.observation_space)
-        and _kind(learned.action_space) in action_kinds
+        and _signature(env.observation_space) == _signature(learned.observation_space)
+        and _signature(env.unwrapped.action_space) == _signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
     )
     require(is_same, "env", f"{must}; got {shortened(env)}.")
 
 
-def _kind(space: Space[Any]) -> tuple[type, int]:
+def _signature(space: Space[Any]) -> tuple[object, ...]:
     """What must be equal for two spaces to be of one task."""
-    return type(space), flatdim(space)
+    return type(space), space.shape, flatdim(space)

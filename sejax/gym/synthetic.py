@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from sejax.envs.spec import Box
 from sejax.gym import networks
-from sejax.gym.tasks import Info, RealTask, space_of
+from sejax.gym.tasks import Info, RealTask
 from sejax.options import one_of, require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import check_tensors
@@ -52,14 +52,13 @@ class SyntheticWorld:
         self.config = config
         self.action_space = task.action_space
         self.max_steps = config.max_steps(task.max_steps)
-        self.draws_ends = config.done in ("bernoulli", "sigmoid") and not config.is_bandit
+        self.draws_ends = config.done == "bernoulli" and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
-        observation = space_of(task.observation_space, "task.observation_space")
-        action_dim = space_of(task.action_space, "task.action_space").size
-        self.obs_dim = observation.size
         self.observation_space, self._units = task.observation_space, None
-        if isinstance(observation, Box):
-            self._units = config.units(observation)
+        self.obs_dim, action_dim = map(spaces.flatdim, (task.observation_space, task.action_space))
+        if isinstance(task.observation_space, spaces.Box):
+            bounds = task.observation_space.low, task.observation_space.high
+            self._units = config.units(Box(*map(tuple, bounds)))
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
         units = config.networks(self.obs_dim, action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
@@ -90,7 +89,7 @@ class SyntheticWorld:
         vector = vector if self._units is None else self._units.decode(vector)
         return np.minimum(np.maximum(vector, -LIMIT), LIMIT)
 
-    def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
+    def encode(self, action: ArrayLike, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
 
         Args:
@@ -136,10 +135,10 @@ class SyntheticWorld:
             reward, done = reward.item(), done.item()
         at_limit = time >= self.max_steps
         may_end = (time >= self.config.min_steps) | absurd
-        terminated = self._ends(done, chance) & may_end | absurd
+        terminated = (chance < done if self.draws_ends else done > 0.5) & may_end | absurd
         discount = 1 - (done * may_end if self.config.done == "soft" else terminated)
         truncated = at_limit
-        if self.config.ends_at_horizon:
+        if self.config.horizon is not None:
             terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
         return outputs[..., :-2], reward, terminated, truncated, discount
@@ -159,9 +158,7 @@ class SyntheticWorld:
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         if known:
             bound = self.action_space.high  # type: ignore[attr-defined]
-            apart = action - bound * np.clip(outputs, -1, 1)
-            cost = np.abs(apart) if self.config.reward_form == "distance" else apart**2
-            outputs = -self.config.reward_slope * cost.sum(axis=-1, keepdims=True)
+            outputs = -np.abs(action - bound * np.clip(outputs, -1, 1)).sum(-1, keepdims=True)
         if self.config.is_bandit:
             whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
             whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1
@@ -169,13 +166,6 @@ class SyntheticWorld:
         if self._units is not None:
             outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
-
-    def _ends(self, done: Any, chance: Any) -> Any:
-        """Whether the done output ends the episode."""
-        if not self.draws_ends:
-            return done > 0.5
-        is_logit = self.config.done == "sigmoid"
-        return chance < ((1 + np.tanh(done / 2)) / 2 if is_logit else done)
 
 
 class SyntheticEnv(gymnasium.Env[Any, Any]):
@@ -185,8 +175,8 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     real one does; or, for tasks of discrete states, the index of the state vector's largest entry.
 
     An episode is *terminated* where the done output d says so (`config.done`), at the step
-    `config.min_steps` at the earliest; where a learned horizon ends it (`config.horizon`, unless it
-    merely cuts); or where an output is not finite or beyond 1e6, which also costs the step its
+    `config.min_steps` at the earliest; where its horizon ends it (`config.horizon`); or where an
+    output is not finite or beyond 1e6, which also costs the step its
     reward and leaves the state where it was. It is *truncated* at the task's step limit, here and
     not by a wrapper. `info["discount"]` is what the agents that an SE was learned with bootstrap
     with: 0 where the episode has terminated and 1 elsewhere, save in an SE with `done=soft`, where
@@ -296,15 +286,15 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         rewards, terminated, truncated, discounts = self.advance(actions)
         self.begin(self._ended)
         ended = terminated | truncated
-        infos = _told(discounts, on)
+        infos = _infos(discounts, on)
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._ended = ended
         elif ended.any():
             obs, final_obs = self.observe(), np.full(self.num_envs, None)
             for i in np.flatnonzero(ended):
                 final_obs[i] = obs[i]
-            infos = {"final_obs": final_obs, "final_info": _told(discounts, ended)}
-            infos |= {"_final_obs": ended, "_final_info": ended} | _told(discounts, ~ended)
+            infos = {"final_obs": final_obs, "final_info": _infos(discounts, ended)}
+            infos |= {"_final_obs": ended, "_final_info": ended} | _infos(discounts, ~ended)
             self.begin(ended)
         return self.observe(), rewards, terminated, truncated, infos
 
@@ -351,6 +341,6 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._times *= ~mask
 
 
-def _told(discounts: np.ndarray, mask: np.ndarray) -> Info:
+def _infos(discounts: np.ndarray, mask: np.ndarray) -> Info:
     """Discounts of some environments in Gymnasium's form of infos; empty if of none."""
     return {"discount": np.where(mask, discounts, 0.0), "_discount": mask} if mask.any() else {}

@@ -12,10 +12,10 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import TimeLimit
 
 from sejax import envs
-from sejax.envs.spec import Box, Discrete, Space, TaskSpec
-from sejax.options import ConfigError, registry, require, shortened
+from sejax.envs.spec import Discrete, Space, TaskSpec
+from sejax.options import registry, require, shortened
 from sejax.options.plain import to_plain
-from sejax.proxies.header import Header, is_same_space
+from sejax.proxies.header import Header
 from sejax.proxies.synthetic import SyntheticConfig
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
@@ -35,11 +35,9 @@ GYMNASIUM_IDS = {
     "reacher": "Reacher-v5",
 }
 GRIDS = ("cliff_walking", "gridworld_2x2")
-GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
 
 Env = gymnasium.Env[Any, Any]
 Info = dict[str, Any]  # of a reset or a step; and what a reset is told
-Starts = Callable[[np.random.Generator], Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,23 +56,7 @@ class RealTask:
     observation_space: spaces.Space[Any]
     action_space: spaces.Space[Any]
     max_steps: int
-    starts: Starts | None = None
-
-    @classmethod
-    def of_gymnasium(cls, env_id: str, max_steps: int | None = None) -> "RealTask":
-        """A task that Gymnasium knows.
-
-        Args:
-          env_id: such as `"CartPole-v1"`.
-          max_steps: replaces Gymnasium's limit.
-
-        Raises:
-          ConfigError: if Gymnasium has no limit for it and none is given.
-          gymnasium.error.Error: if Gymnasium cannot make it.
-        """
-        return cls.of_env(
-            gymnasium.make(env_id, max_episode_steps=max_steps, disable_env_checker=True)
-        )
+    starts: Callable[[np.random.Generator], Any] | None = None
 
     @classmethod
     def of_spec(cls, spec: TaskSpec) -> "RealTask":
@@ -122,7 +104,7 @@ def real_env(header: Header, **options: Any) -> Env:
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
-    is_known &= fields.pop("backend", "mujoco") in GYMNASIUM_BACKENDS
+    is_known &= fields.pop("backend", "mujoco") != "spring"  # whose dynamics are others
     must = "must be given, because Gymnasium has none that is the same"
     fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
     require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")
@@ -150,13 +132,14 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
             return learned
         task = RealTask.of_env(real_env(header, disable_env_checker=True))
     if isinstance(task, str):
-        task = RealTask.of_gymnasium(task, limit)
-    action = space_of(task.action_space, "task.action_space")
-    is_same = config.max_steps(task.max_steps) == config.max_steps(limit)
-    is_same &= bool(is_same_space(action, header.spec.action))
+        env = gymnasium.make(task, max_episode_steps=limit, disable_env_checker=True)
+        task = RealTask.of_env(env)
+    has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
     must = f"must have the SE's actions, {learned.action_space}, and its step limit, {limit}"
     got = f"got {shortened(task.action_space)} and {task.max_steps}"
-    require(is_same, "task", f"{must}; {got}. Set max_steps, or wrap it in RescaleAction.")
+    fix = "Set max_steps, or wrap it in RescaleAction"
+    is_same = has_limit and task.action_space == learned.action_space
+    require(is_same, "task", f"{must}; {got}. {fix}.")
     return task
 
 
@@ -229,17 +212,3 @@ def _gymnasium_space(space: Space) -> spaces.Space[Any]:
         return spaces.Discrete(space.n)
     low, high = np.array([space.low, space.high], np.float32)
     return spaces.Box(low, high, dtype=np.float32)
-
-
-def space_of(space: spaces.Space[Any], name: str) -> Space:
-    """A space of Gymnasium as sejax has it.
-
-    Raises:
-      ConfigError: if its elements are neither vectors nor indices from 0 on.
-    """
-    if isinstance(space, spaces.Discrete) and space.start == 0:
-        return Discrete(int(space.n))
-    if isinstance(space, spaces.Box) and len(space.shape) == 1:
-        return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
-    got = shortened(space)
-    raise ConfigError(f"{name} must be a Box of vectors or a Discrete from 0; got {got}.", name)

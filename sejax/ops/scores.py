@@ -24,3 +24,10 @@ def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
 def or_lowest(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Scores in which what is not finite is minus infinity."""
     return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
+
+
+def or_worst(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Scores in which what is not finite is the worst finite one, or 0 if there is none."""
+    finite = jnp.isfinite(scores)
+    worst = jnp.min(jnp.where(finite, scores, jnp.inf))
+    return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))

@@ -1,8 +1,8 @@
 """The contract of a proxy: an environment with weights that stands in for a real task.
 
 A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent trains in
-it as in any other environment. What the inner loop must know beside that is told by `is_real`,
-`episode_limit` and `prepare`, of a proxy and of any other environment.
+it as in any other environment. What the inner loop must know beside that is in `ProxyEnv.is_real`,
+`ProxyEnv.max_steps` and `ProxyEnv.prepare`.
 """
 
 import copy
@@ -54,11 +54,6 @@ class ProxyConfig(Options, ABC):
         return False
 
     @property
-    def sees_bounds(self) -> bool:
-        """Whether the bounds of the task's observations are part of the proxy."""
-        return False
-
-    @property
     def reaches_step_limit(self) -> bool:
         """Whether episodes of nearly all proxies of this kind last to their step limit."""
         return False
@@ -90,7 +85,6 @@ class ProxyParams(EnvParams):
     """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
-    max_steps_in_episode: int = 1
 
 
 class ProxyEnv(Environment, ABC):
@@ -176,17 +170,3 @@ class ProxyEnv(Environment, ABC):
 def is_real(env: Environment) -> bool:
     """Whether steps in an environment are steps of a real task."""
     return not isinstance(env, ProxyEnv) or env.is_real
-
-
-def episode_limit(env: Environment) -> int | None:
-    """Steps that an episode cannot exceed; None where only the params tell."""
-    return env.max_steps if isinstance(env, ProxyEnv) else None
-
-
-def prepare(
-    env: Environment, params: PyTree, discount: Array | float | None, limit_is_terminal: bool
-) -> Any:
-    """An environment's params for the whole training of one agent; see `ProxyEnv.prepare`."""
-    if not isinstance(env, ProxyEnv):
-        return params
-    return env.prepare(params, discount, limit_is_terminal)

@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from sejax.envs.base import Task
 from sejax.options import require
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig
+from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig, Vector
 
 Layer = tuple[np.ndarray, np.ndarray]  # kernel [out, in] and bias [out] of an affine map
 
@@ -51,8 +51,7 @@ def make_exact(
       The SE, and its weights; `sejax.save` writes them.
 
     Raises:
-      ConfigError: for a task with discrete observations, layers that do not fit it, or numbers that
-        are not finite.
+      ConfigError: for a task with discrete observations, or layers that do not fit it.
 
     Example:
       >>> import sejax
@@ -65,7 +64,12 @@ def make_exact(
     """
     states = np.asarray(states, float)
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
-    _require_fit(task, layers, states)
+    require_vectors(task)
+    shapes = [kernel.shape for kernel, _ in layers]
+    sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
+    is_chain = layers and shapes == [*zip(sizes[1:], sizes[:-1], strict=True)]
+    must = f"must be layers from {task.obs_dim} numbers to {task.action_dim}; got {shapes}."
+    require(is_chain and sizes[-1] == task.action_dim, "policy", must)
     is_discrete = task.num_actions is not None
     reward = _preference(layers, states) if is_discrete else _as_network(layers, task.max_action)
     config = SyntheticConfig(
@@ -80,20 +84,6 @@ def make_exact(
         "start": _as_weights(gaussian(states, independent_starts), config.start_hidden_size),
     }
     return config.make(task), weights
-
-
-def _require_fit(task: Task, layers: Sequence[Layer], states: np.ndarray) -> None:
-    require_vectors(task)
-    is_fit = states.shape[1:] == (task.obs_dim,) and len(states) > 1 and np.isfinite(states).all()
-    must = f"must be finite observations that the policy visited, [state, {task.obs_dim}]"
-    require(is_fit, "states", f"{must}; got others, {list(states.shape)}.")
-    sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
-    shapes = [kernel.shape for kernel, _ in layers]
-    is_chain = shapes == [*zip(sizes[1:], sizes[:-1], strict=True)] and len(layers) > 0
-    is_finite = all(np.isfinite(numbers).all() for layer in layers for numbers in layer)
-    must = f"must be finite layers from {task.obs_dim} numbers to {task.action_dim}"
-    is_policy = is_chain and sizes[-1] == task.action_dim and is_finite
-    require(is_policy, "policy", f"{must}; got {shapes}. Set layers=[(kernel, bias)].")
 
 
 def require_vectors(task: Task) -> None:
@@ -174,7 +164,7 @@ def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     return weights
 
 
-def evaluate(layers: Sequence[Layer], inputs: Any) -> Any:
+def evaluate(layers: Sequence[Layer], inputs: Vector) -> Vector:
     """The policy's outputs `[state, action_dim]` for states `[state, obs_dim]`, before clipping.
 
     Of NumPy or JAX.

@@ -63,16 +63,15 @@ class Header:
         for record in self.proxies:
             numbers += [record[name] for name in ("score", "generation", "seed") if name in record]
             numbers += dict(record.get("scores", {})).values()
-        if not (all(map(is_number, numbers)) and 0 <= self.discount <= 1):
-            raise ValueError("a record without numbers, or a discount outside of [0, 1]")
+        are_numbers = all(map(is_number, numbers)) and 0 <= self.discount <= 1
         np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
         sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
         are_counts = all(type(size) is int and 0 < size <= LARGEST for size in sizes)
         with np.errstate(over="ignore"):  # nan, and bounds beyond single precision, are changed
             is_same = spec.interface == self.interface
-        if not (are_counts and is_same):
-            raise ValueError("a space or step limit that no task has")
+        if not (are_numbers and are_counts and is_same):
+            raise ValueError("a number, a space or a step limit that no proxy has")
 
     @property
     def spec(self) -> TaskSpec:
@@ -105,13 +104,6 @@ def _sizes_of(space: Space) -> list[int]:
         return [space.n]
     are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
     return [space.size * are_bounds]
-
-
-def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
-    """Whether two spaces are the same but for rounding."""
-    if not (isinstance(one, Box) and isinstance(other, Box) and one.size == other.size):
-        return one == other
-    return not with_bounds or np.allclose([one.low, one.high], [other.low, other.high])
 
 
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:

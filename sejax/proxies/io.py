@@ -22,11 +22,11 @@ from sejax.envs.environment import Environment
 from sejax.envs.spec import TaskSpec
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, as_python, registry, require, shortened, told, unknown_name
+from sejax.options import ConfigError, as_python, one_of, registry, require, shortened, told
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
+from sejax.proxies.header import Header, Stored, agents_of, check_tensors
 from sejax.training import TrainingConfig
 
 
@@ -107,9 +107,9 @@ class Proxy(_Loaded):
         return fingerprint(self.params.weights)
 
 
-def fingerprint(weights: Any) -> str:
+def fingerprint(weights: PyTree) -> str:
     """Eight hexadecimal digits that tell nested weights from others."""
-    flat = _flatten(weights)
+    flat = flatten_dict(weights, sep="/")
     content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
     return hashlib.sha256(content).hexdigest()[:8]
 
@@ -131,7 +131,7 @@ class ProxySet(_Loaded):
       path: the file.
     """
 
-    weights: Any
+    weights: PyTree
     records: tuple[dict[str, Any], ...]
 
     def __len__(self) -> int:
@@ -196,8 +196,7 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
     env, config = _stored_env(proxy)
     stored = agents_of(config)
     name = next(iter(stored)) if name is None else name
-    if name not in stored:
-        raise unknown_name("name", name, list(stored))
+    one_of(stored)("name", name, None)
     agent = header.configured("agent", stored[name], env.name)
     explored = config.get("exploration", {"name": "none"})
     return make_agent(agent, env.task, header.configured("exploration", explored, env.name))
@@ -257,8 +256,6 @@ def budget_for(
     max_steps = training.max_steps
     if max_steps is None:
         return training
-    if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
-        max_steps = min(max_steps, training.max_episodes * max_episode_steps)
     limits = max_episode_steps, task_max_steps
     waited = max((x.steps_before_learning(*limits) for x in learned_with), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)
@@ -308,7 +305,7 @@ def save(
 def save_set(
     path: str | Path,
     env: ProxyEnv,
-    weights: Sequence[Any],
+    weights: Sequence[PyTree],
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None = None,
     discount: float | None = None,
@@ -316,19 +313,16 @@ def save_set(
     """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
 
     Raises:
-      ConfigError: as `save`, or if there are not as many records as proxies.
+      ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    got = f"got {len(records)} for {len(weights)}. Set records=[{{}}] * len(weights)"
-    is_fit = len(weights) == len(records) > 0
-    require(is_fit, "records", f"must be one for each proxy; {got}.")
     _write(path, env, weights, records, config, discount, is_set=True)
 
 
 def _write(
     path: str | Path,
     env: ProxyEnv,
-    weights: Sequence[Any],
+    weights: Sequence[PyTree],
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None,
     discount: float | None,
@@ -337,13 +331,11 @@ def _write(
     is_known = discount is not None or not env.config.needs_discount
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(is_known, "discount", must)
-    stacked: dict[str, list[np.ndarray]] = {}
-    for nested in weights:
-        tensors = {name: np.asarray(x, np.float32) for name, x in _flatten(nested).items()}
-        check_tensors("weights", tensors, _shapes_of(env), "params.weights")
-        stacked = {name: [*stacked.get(name, []), x] for name, x in tensors.items()}
-    if is_set:
-        tensors = {name: np.stack(arrays) for name, arrays in stacked.items()}
+    stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
+    tensors = flatten_dict(stacked, sep="/")
+    _require_weights("weights", tensors, env, len(records), "params.weights")
+    if not is_set:
+        tensors = {name: x[0] for name, x in tensors.items()}
     known = {"env": env.task.origin or {"name": env.task.name}}
     known["proxy"] = registry.describe("proxy", env.config)
     try:
@@ -366,15 +358,13 @@ def _write(
     write_bytes(Path(path).expanduser(), data)
 
 
-def _flatten(weights: PyTree) -> dict[str, Any]:
-    """Nested weights by `network/layer/parameter`."""
-    return flatten_dict(weights, sep="/")
-
-
-def _shapes_of(env: ProxyEnv) -> dict[str, tuple[int, ...]]:
-    """Shape of each of a proxy's weights."""
+def _require_weights(
+    field: str, tensors: Mapping[str, np.ndarray], env: ProxyEnv, count: int, fix: str
+) -> None:
+    """Checks the tensors of so many proxies, by `network/layer/parameter`."""
     weights = jax.eval_shape(env.init_weights, jax.random.key(0))
-    return {name: x.shape for name, x in _flatten(weights).items()}
+    shapes = {name: (count, *x.shape) for name, x in flatten_dict(weights, sep="/").items()}
+    check_tensors(field, tensors, shapes, fix)
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -468,8 +458,8 @@ def _proxies_of(
     path, tensors, learned = stored
     if not learned.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    shapes = {name: (len(learned.proxies), *shape) for name, shape in _shapes_of(env).items()}
-    check_tensors(option, tensors, shapes, "a file that sejax has written")
+    fix = "a file that sejax has written"
+    _require_weights(option, tensors, env, len(learned.proxies), fix)
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),
@@ -483,8 +473,7 @@ def _proxies_of(
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
     learned, where = stored.header, stored.path.name
-    if proxy is None:
-        proxy = header.configured("proxy", learned.config["proxy"], where)
+    proxy = proxy or header.configured("proxy", learned.config["proxy"], where)
     real = task
     if real is None:
         try:
@@ -499,25 +488,15 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
     require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
     if task is not None:
         _require_same(learned, task, proxy, where)
-    env: ProxyEnv = registry.make("proxy", proxy, real)
-    return env
+    return registry.make("proxy", proxy, real)
 
 
 def _require_same(learned: Header, task: Task, proxy: ProxyConfig, where: str) -> None:
-    """Checks that a task given is that of the proxy, as far as the proxy depends on it.
-
-    An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
-    does not know the bounds of observations.
-    """
-    spec = learned.spec
-    is_same = (
-        is_same_space(spec.observation, task.observation, proxy.sees_bounds)
-        and is_same_space(spec.action, task.action)
-        and (spec.max_steps == task.max_steps or proxy.has_real_dynamics)
-    )
-    must = f"must have {spec.max_steps} steps, as {shortened(where, 40)}, and the same spaces"
-    wanted, got = (shortened(x, 70) for x in (learned.interface, task.interface))
-    require(is_same, "task", f"{must}, {wanted}; got {task.max_steps} steps, {got}.")
+    """Checks that a task given is that of the proxy: spaces and, for an SE, the step limit."""
+    limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
+    wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))
+    must = f"must have the spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
+    require(learned.interface | limit == task.interface, "task", must)
 
 
 # --- a task that cannot be made here --------------------------------------------------------------

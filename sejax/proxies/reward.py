@@ -113,7 +113,6 @@ class RewardState(EnvState):
     world: Any  # the real task's state
     obs: Array  # what the agent saw last
     augmentation: Float[Array, " keys"]  # v of that state; zeros before the first step
-    time: Array | int
 
 
 @struct.dataclass
@@ -122,7 +121,6 @@ class RewardParams(EnvParams):
     potentials: Array | None = None  # [num_states], if `prepare` found discrete states
     discount: Array | float = 1.0  # gamma; `prepare` puts the agent's here
     limit_is_terminal: Array | bool = False  # whether episodes end for the agent at the step limit
-    max_steps_in_episode: int = 1
 
 
 class RewardEnv(ProxyEnv):

@@ -6,7 +6,7 @@ and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Le
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.envs.spec import Box, TaskSpec
 from sejax.ops.networks import MLP
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams
 
 START_HIDDEN_SIZE = 32  # units of the network that makes initial states
@@ -55,8 +55,8 @@ class SyntheticConfig(ProxyConfig):
 
     Attributes:
       done: How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 -
-        d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
-        with probability sigmoid(d). Agents see all ends but the first.
+        d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1). Agents
+        see all ends but the first.
       min_steps: First step of an episode that d may end it at; before it, targets bootstrap with 1.
         An SE of episodes of a step or two is a bandit, whatever its networks could do.
       initial_state: real: the task's initial states; learned: standard normal noise plus a
@@ -64,41 +64,33 @@ class SyntheticConfig(ProxyConfig):
       state_units: Units in which the networks see and make states. raw: the task's own; bounds: 0
         is the middle of a bounded observation and 1 is half of the way to its bound. A car's
         velocity lies in [-0.07, 0.07], where noise of 1 would be no measure.
-      horizon: Steps of an episode; null: the task's limit. 1: a contextual bandit, which has
-        neither a next-state nor a done network.
+      horizon: Steps of an episode, the last of which terminates it; null: the task's limit, which
+        truncates it. 1: a contextual bandit, which has neither a next-state nor a done network.
       reward_form: What the reward network of a bandit makes. network: the reward of an action;
-        distance, quadratic: the best of continuous actions, in units of their bound, from which the
-        reward is minus the sum of the distances, or of their squares, so that the best policy is
-        known.
-      reward_slope: What such a reward takes for each unit of it.
-      horizon_is_terminal: Whether the horizon terminates an episode, so that nothing is
-        bootstrapped there, or truncates it, as the task's limit does.
+        distance: the best of continuous actions, in units of their bound. The reward is minus the
+        sum of the distances from it, so that the best policy is known.
     """
+
+    removed: ClassVar[dict[str, Any]] = {"reward_slope": 1.0, "horizon_is_terminal": True}
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    done: str = option("threshold", one_of(("soft", "threshold", "bernoulli", "sigmoid")))
+    done: str = option("threshold", one_of(("soft", "threshold", "bernoulli")))
     min_steps: int = option(1, counts("an episode has steps"))
     initial_state: str = option("learned", one_of(("real", "learned", "noise")))
     state_units: str = option("raw", one_of(("raw", "bounds")))
     horizon: int | None = option(1, counts("an episode has steps"))
-    reward_form: str = option("network", one_of(("network", "distance", "quadratic")))
-    reward_slope: float = option(1.0, positive("a reward must tell actions apart"))
+    reward_form: str = option("network", one_of(("network", "distance")))
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
-    horizon_is_terminal: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        horizon, is_network = self.horizon, self.reward_form == "network"
-        can_end = horizon is None or self.min_steps <= horizon
-        self._require(can_end, "min_steps", horizon, "or less, with a horizon of as many steps")
-        has_next = horizon != 1 or self.horizon_is_terminal
-        self._require(has_next, "horizon_is_terminal", True, "with proxy.horizon=1")
-        is_known = horizon == 1 or is_network
+        can_end = self.horizon is None or self.min_steps <= self.horizon
+        why = "or less, with a horizon of as many steps"
+        self._require(can_end, "min_steps", self.horizon, why)
+        is_known = self.is_bandit or self.reward_form == "network"
         self._require(is_known, "reward_form", "network", "but with proxy.horizon=1")
-        has_slope = not is_network or self.reward_slope == 1
-        self._require(has_slope, "reward_slope", 1.0, "with proxy.reward_form=network")
 
     @property
     def is_bandit(self) -> bool:
@@ -106,17 +98,8 @@ class SyntheticConfig(ProxyConfig):
         return self.horizon == 1
 
     @property
-    def ends_at_horizon(self) -> bool:
-        """Whether the step limit terminates an episode in place of truncating it."""
-        return self.horizon is not None and self.horizon_is_terminal
-
-    @property
     def needs_task(self) -> bool:
         return self.initial_state == "real"
-
-    @property
-    def sees_bounds(self) -> bool:
-        return self.state_units == "bounds"
 
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that the reward's form is one for the task's actions.
@@ -183,7 +166,6 @@ class SyntheticConfig(ProxyConfig):
 @struct.dataclass
 class SyntheticState(EnvState):
     vector: Array  # [obs_dim]: what the networks see and predict
-    time: Array | int
 
 
 class SyntheticEnv(ProxyEnv):
@@ -205,8 +187,8 @@ class SyntheticEnv(ProxyEnv):
       are the same on average. Rewards cannot take its place: what a target loses by it is
       :math:`\gamma d V(s')`, of the agent's own values.
     - `min_steps`: the first step that d may end an episode at.
-    - `horizon`: steps of an episode. The last one terminates it if `horizon_is_terminal`. At the
-      task's own limit, with no horizon, the episode is truncated.
+    - `horizon`: steps of an episode. The last one terminates it. At the task's own limit, with no
+      horizon, the episode is truncated.
 
     Continuous actions are clipped to the task's bounds, as by the task itself.
 
@@ -289,14 +271,12 @@ class SyntheticEnv(ProxyEnv):
             may_end = state.time >= self.config.min_steps
             ends, discount = ends & may_end, jnp.where(may_end, discount, 1.0)
         ends |= ~is_sane
-        at_horizon = jnp.bool_(False)
-        if self.config.ends_at_horizon:
-            at_horizon = state.time >= params.max_steps_in_episode
+        at_horizon = self.config.horizon is not None and state.time >= params.max_steps_in_episode
         terminated = ends | at_horizon
         if self.config.done != "soft":
             discount = 1.0 - ends
         info = {
-            "discount": jnp.where(is_sane & ~at_horizon, discount, 0.0),
+            "discount": jnp.where(is_sane & jnp.logical_not(at_horizon), discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),
         }
         return self.get_obs(state), state, jnp.where(is_sane, reward, 0.0), terminated, info
@@ -305,13 +285,11 @@ class SyntheticEnv(ProxyEnv):
         """Whether the done output ends the episode."""
         if self.config.done == "bernoulli":
             return jax.random.uniform(key) < done  # in [0, 1): never for d <= 0, always for d >= 1
-        if self.config.done == "sigmoid":
-            return jax.random.uniform(key) < jax.nn.sigmoid(done)
         return done > 0.5
 
-    def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Any:
+    def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Array:
         """Whether the episode is at its limit, unless that terminates it."""
-        if self.config.ends_at_horizon:
+        if self.config.horizon is not None:
             return jnp.bool_(False)
         return super().is_truncated(state, params)
 
@@ -326,12 +304,12 @@ class SyntheticEnv(ProxyEnv):
 class BanditEnv(SyntheticEnv):
     r"""An SE with `horizon=1`, a contextual bandit: its one network makes the reward.
 
-    Its only step terminates the episode and leaves the state as it is. With `reward_form` distance
-    or quadratic the network's output u(s), in units of the bound b, is the best action:
+    Its only step terminates the episode and leaves the state as it is. With `reward_form=distance`
+    the network's output u(s), in units of the bound b, is the best action:
 
-    .. math:: r(s, a) = -c \sum_i |a_i - \mathrm{clip}(b u_i(s), \pm b)|^p, \quad p \in \{1, 2\}
+    .. math:: r(s, a) = -\sum_i |a_i - b\, \mathrm{clip}(u_i(s), -1, 1)|
 
-    Source: forms of the reward: ours.
+    Source: this form of the reward: ours.
     """
 
     def predict(
@@ -343,8 +321,7 @@ class BanditEnv(SyntheticEnv):
             return vector, reward[0], jnp.float32(1)
         best = self._apply(weights, "reward", self._seen(vector))
         apart = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
-        cost = jnp.abs(apart) if self.config.reward_form == "distance" else apart**2
-        return vector, -self.config.reward_slope * cost.sum(), jnp.float32(1)
+        return vector, -jnp.abs(apart).sum(), jnp.float32(1)
 
     def bandit_reward(
         self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array

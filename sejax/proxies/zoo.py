@@ -211,11 +211,7 @@ def card_of(
 
 
 def push(
-    source: str | Path,
-    repo: str,
-    *,
-    private: bool = False,
-    license: str = "apache-2.0",
+    source: str | Path, repo: str, *, private: bool = False, license: str = "apache-2.0"
 ) -> str:
     """Puts a proxy on the Hugging Face Hub, from where `sejax.load("hf://USER/REPO")` loads it.
 

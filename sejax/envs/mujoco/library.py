@@ -24,10 +24,6 @@ TARGETS = {"sejax_mujoco_reset": "SejaxMujocoReset", "sejax_mujoco_step": "Sejax
 _LOADING = threading.Lock()
 
 
-class BuildError(ConfigError):
-    """The library cannot be built or loaded; the message says why, and what helps."""
-
-
 def load() -> ctypes.CDLL:
     """The library of this process, whose handlers XLA then knows as `TARGETS`.
 
@@ -37,8 +33,12 @@ def load() -> ctypes.CDLL:
     builds its own.
 
     Raises:
-      BuildError: if it has to be built and cannot be.
+      ConfigError: if it has to be built and cannot be, or JAX's default device is no CPU; the
+        message says what helps.
     """
+    got = f"got {jax.default_backend()}. Set JAX_PLATFORMS=cpu"
+    if jax.default_backend() != "cpu":
+        raise ConfigError(f"must run on the CPU; {got}")
     with _LOADING:  # XLA takes one library of a process, and no second one
         return _load()
 
@@ -61,7 +61,7 @@ def _load() -> ctypes.CDLL:
             return _register(built)
         except OSError as error:
             fix = "Set SEJAX_CACHE_DIR, or TMPDIR, to a folder that programs can be run from"
-            raise BuildError(f"it cannot be loaded ({told(error)}). {fix}") from error
+            raise ConfigError(f"cannot load its library ({told(error)}). {fix}") from error
 
 
 def file_name() -> str:
@@ -80,7 +80,7 @@ def build(path: Path) -> None:
     MuJoCo is bound by its file's name alone, as the process has it loaded already.
 
     Raises:
-      BuildError: if the compiler is not there, or fails.
+      ConfigError: if the compiler is not there, or fails.
     """
     package = Path(mujoco.__file__).parent
     mujoco_library = min(package.glob("libmujoco*"))
@@ -90,7 +90,8 @@ def build(path: Path) -> None:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
         said = shortened(error if isinstance(error, OSError) else error.stderr.strip(), 120)
-        raise BuildError(f"{command[0]} failed with: {said}. Mend that, or set CXX") from error
+        message = f"needs a C++ compiler; {command[0]} failed with: {said}. Mend that, or set CXX"
+        raise ConfigError(message) from error
 
 
 def compiler() -> list[str]:

@@ -7,6 +7,7 @@ task is made.
 Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
 """
 
+import dataclasses
 import io
 import math
 import warnings
@@ -40,18 +41,12 @@ _INFO_IN_A_PLANE = (*_STATE_KEYS[:2], "distance_from_origin", *_STATE_KEYS[2:], 
 
 
 def _spec(
-    obs_dim: int,
-    action_dim: int,
-    *,
-    solved_reward: float,
-    max_action: float = 1.0,
-    max_steps: int = 1000,
-    info_keys: tuple[str, ...] = (),
+    obs_dim: int, action_dim: int, *, solved_reward: float, info_keys: tuple[str, ...] = ()
 ) -> TaskSpec:
     return TaskSpec(
         observation=Box.symmetric(*[math.inf] * obs_dim),
-        action=Box.symmetric(*[max_action] * action_dim),
-        max_steps=max_steps,
+        action=Box.symmetric(*[1.0] * action_dim),
+        max_steps=1000,
         solved_reward=solved_reward,
         info_keys=info_keys,
         augmented_keys=tuple(key for key in info_keys if key in _STATE_KEYS),
@@ -99,11 +94,9 @@ class HalfCheetah(MujocoTask):
 
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
-            raise ConfigError(
-                f"env.backend must be mujoco without brax; got {self.backend} ({error}). "
-                "Install brax with pip install 'sejax[brax]'.",
-                "env.backend",
-            ) from error
+            fix = f"got {self.backend} ({error}). Install it with pip install 'sejax[brax]'"
+            message = f"env.backend must be mujoco without brax; {fix}."
+            raise ConfigError(message, "env.backend") from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
@@ -231,7 +224,7 @@ class InvertedPendulum(MujocoTask):
     file = "inverted_pendulum.xml"
     frame_skip = 2
     num_hidden = 0
-    spec = _spec(4, 1, max_action=3.0, solved_reward=950.0)
+    spec = dataclasses.replace(_spec(4, 1, solved_reward=950.0), action=Box.symmetric(3.0))
 
     reset_noise_scale: float = option(0.01, not_negative("it is a range"))
 
@@ -308,6 +301,7 @@ def _forces(now: "Report") -> Float[Array, "nbody 6"]:
 
 
 _RADIUS = 0.2  # m, of the disc that the target is in
+_PENALTIES = ("reward_dist", "reward_ctrl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,7 +317,9 @@ class Reacher(MujocoTask):
     name = "reacher"
     file = "reacher.xml"
     frame_skip = 2
-    spec = _spec(10, 2, max_steps=50, solved_reward=-3.75, info_keys=("reward_dist", "reward_ctrl"))
+    spec = dataclasses.replace(
+        _spec(10, 2, solved_reward=-3.75, info_keys=_PENALTIES), max_steps=50
+    )
 
     reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
     reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))
