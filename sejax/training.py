@@ -369,9 +369,10 @@ class _Loop:
         num_steps = state.step
         large, state = jax.lax.fori_loop(0, length, step, (large, state))
         (stored, _), (key, _) = large, consts
+        last = dataclasses.replace(state, step=state.step - 1)
         agent_state = jax.lax.cond(
             state.step == num_steps + length,
-            partial(self.learn, stored[0], None, state, step_keys(key, state.step - 1, 6)),
+            partial(self.learn, stored[0], None, last, step_keys(key, last.step, 6)),
             lambda agent_state: agent_state,
             state.agent_state,
         )

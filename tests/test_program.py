@@ -1,5 +1,7 @@
 """What the compiler made of the inner loop: what is large is written in place."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,8 @@ def case():
     env = registry.make("proxy", paper_se(hidden_size=4), envs.make("cartpole"))
     network = {"hidden_size": 4, "num_layers": 1, "batch_size": 4}
     agent = DDQN(DDQNConfig(**network, warmup_episodes=1, buffer_size=CAPACITY), 4, 2).agent()
+    spec = dataclasses.replace(agent.spec, cpu_num_parallel=None)  # a vmap's agents step together
+    agent = dataclasses.replace(agent, spec=spec)
     train = make_trainer(agent, env, paper_training(max_episodes=MAX_EPISODES, window=2))
     params = env.params(env.init_weights(jax.random.key(0)))
     return train, agent, params.replace(max_steps_in_episode=jnp.int32(5))

@@ -8,7 +8,6 @@ from torch_networks import TorchMLP, follow, tensors, write_golden
 
 from sejax.agents.dqn import DDQN
 
-
 PARTS = ("features", "value", "advantage")
 
 

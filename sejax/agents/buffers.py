@@ -85,7 +85,7 @@ class Buffer:
       batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
         `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
         is not None, have weight 0.
-      learns_every: steps from one update to the next.
+      learns_every: steps from one update to the next; above 1 `batch` has no transition but None.
     """
 
     init: Callable[[], PyTree]
