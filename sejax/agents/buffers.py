@@ -90,7 +90,7 @@ class Buffer:
 
     init: Callable[[], PyTree]
     store: Callable[[PyTree, Array, Transition, Array, Array | bool], PyTree]
-    batch: Callable[[Array, PyTree, Array, Transition, Array | None], PyTree]
+    batch: Callable[[Array, PyTree, Array, Transition | None, Array | None], PyTree]
     learns_every: int = 1
 
 

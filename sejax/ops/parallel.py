@@ -188,16 +188,22 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
 
     @one.def_vmap
     def _(size: int, in_batched: list[PyTree], args: tuple[PyTree, ...]) -> tuple[T, PyTree]:
-        leaves, structure = jax.tree.flatten(args)
         is_batched = jax.tree.leaves(in_batched)
 
-        def run(*elements: Array) -> T:
-            rest = iter(elements)
-            whole = [next(rest) if x else leaf for x, leaf in zip(is_batched, leaves, strict=True)]
-            return fn(*jax.tree.unflatten(structure, whole))
+        def all_of_them(*args: PyTree) -> T:
+            leaves, structure = jax.tree.flatten(args)
 
-        batched = tuple(leaf for x, leaf in zip(is_batched, leaves, strict=True) if x)
-        out = map_in_batches(run, min(width or size, size), batched)
+            def run(*elements: Array) -> T:
+                rest = iter(elements)
+                pairs = zip(is_batched, leaves, strict=True)
+                whole = [next(rest) if x else leaf for x, leaf in pairs]
+                return fn(*jax.tree.unflatten(structure, whole))
+
+            batched = tuple(leaf for x, leaf in zip(is_batched, leaves, strict=True) if x)
+            return map_in_batches(run, min(width or size, size), batched)
+
+        # Under a second `vmap` one such map follows the other.
+        out = in_batches_on_cpu(all_of_them, width and 1)(*args)
         return out, jax.tree.map(lambda _: True, out)
 
     return lambda *args: one(args) if on_cpu() else fn(*args)
