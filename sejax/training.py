@@ -371,7 +371,7 @@ class _Loop:
         (stored, _), (key, _) = large, consts
         last = dataclasses.replace(state, step=state.step - 1)
         agent_state = jax.lax.cond(
-            state.step == num_steps + length,
+            (state.step == num_steps + length) & (state.episode >= self.agent.spec.learns_from),
             partial(self.learn, stored[0], None, last, step_keys(key, last.step, 6)),
             lambda agent_state: agent_state,
             state.agent_state,
