@@ -105,7 +105,9 @@ TRANSFORMS: dict[str, ScoreTransform] = {
 }
 
 
-def require_transform(field: str, choice: object, default: object = None) -> None:
+def require_transform(
+    field: str, choice: str | OwnTransform, default: str | OwnTransform | None = None
+) -> None:
     """Checks that it is a name, a `module:attribute` that may be imported, or a function.
 
     Raises:
@@ -114,7 +116,7 @@ def require_transform(field: str, choice: object, default: object = None) -> Non
     if isinstance(choice, str) and ":" in choice:
         registry.require_path(field, choice)
     elif not callable(choice) and choice not in [*TRANSFORMS]:
-        raise unknown_name(field, choice, TRANSFORMS)
+        raise unknown_name(field, str(choice), TRANSFORMS)
 
 
 def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:

@@ -1,5 +1,6 @@
 """Parts of a program, each given as it is or as a configuration that makes it."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from sejax.options import registry, require, shortened
@@ -12,7 +13,8 @@ T_co = TypeVar("T_co", covariant=True)
 class Makes(Protocol[T_co]):
     """A configuration that makes a part, of a task or of whatever such a part is for."""
 
-    def make(self, argument: Any, /) -> T_co: ...
+    @property
+    def make(self) -> Callable[..., T_co]: ...
 
 
 @runtime_checkable

@@ -364,5 +364,4 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 def _use_one_core() -> None:
     """Keeps this process on one CPU core, whatever else there is; before jax first computes."""
     runtime.configure_xla(1)
-    if not runtime.is_started():
-        jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_platforms", "cpu")
