@@ -32,6 +32,10 @@ from sejax.options import (
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
+# Fields of earlier versions, with the only value that a file may still give them: what is computed
+# without them.
+GONE = {"torso": None, "num_filters": 16, "loss": "squared", "compared_by": "advantage"}
+GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
 
@@ -74,9 +78,8 @@ def from_plain(
         ) from error
     defaults, fields = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
-    removed = getattr(cls, "removed", {})
     for name, value in values.items():
-        if name in removed and removed[name] == value:
+        if name not in defaults and GONE.get(name, MISSING) == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
@@ -115,7 +118,8 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     field, last = shortened(field, 40), field.rpartition(".")[2]
     ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
     fix = f" Did you mean {ranked[0]}?" if ranked else ""
-    return ConfigError(f"{field} is no field.{fix} Fields: {listed(ranked)}.", field)
+    is_no = "is no field any more" if last in GONE else "is no field"
+    return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
 
 
 def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
@@ -149,9 +153,8 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
     raise ConfigError(f"{name} must {must}; got {shortened(repr(value))}. Set {name}={fix}.", name)
 
 
-@functools.cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+_CONVERSION = ConfigDict(arbitrary_types_allowed=True)
+_adapter = functools.cache(functools.partial(TypeAdapter, config=_CONVERSION))
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

@@ -277,13 +277,14 @@ def make(group: str, config: "Makes[T]", *arguments: Any) -> T:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
     key = (group, config if is_hashable(config) else id(config), *arguments)
-    if key not in _PARTS:
+    if key in _PARTS:
+        part: T = _PARTS[key][1]
+    else:
         part, cls = config.make(*arguments), _attribute(GROUPS[group].makes)
         name = shortened(name_of(group, config))
         message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
         require(isinstance(part, cls), group, message)
         _PARTS[key] = config, part  # with config, its id stays its own
-    part = _PARTS[key][1]
     return part
 
 

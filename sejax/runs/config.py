@@ -359,8 +359,8 @@ def _from_plain(
     is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
     message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
     require(is_map and several, "agents", message)
-    of_mixture = (*fields_of(MixtureConfig), *MixtureConfig.removed) if schema.learns else ()
-    shared = {name: several[name] for name in of_mixture if name in several}
+    shared = {name: x for name, x in several.items() if not isinstance(x, Mapping)}
+    shared = shared if schema.learns else {}
     keys, weights = sorted(several.keys() - shared.keys()), []
     objects["agents"] = {}
     for key in keys:
