@@ -102,6 +102,50 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
+    def require_fit(self, key: str, spec: TaskSpec, task_name: str) -> None:
+        """Checks that one of the agents can act in a task.
+
+        Raises:
+          ConfigError: if it cannot.
+        """
+        with errors_of("agent", field_of(key, self.agents)):
+            agents.require_fit(self.agents[key], self.exploration, spec, task_name)
+
+    def require_learning(
+        self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
+    ) -> None:
+        """Checks that an agent learns something on a proxy.
+
+        Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a
+        step budget must let it learn. What stops it must not read the proxy's returns.
+
+        Args:
+          key: of the agent.
+          group: of the fields of its training.
+          training: how long it trains.
+          proxy: the proxy's configuration.
+          spec: of the real task.
+
+        Raises:
+          ConfigError: if it does not.
+        """
+        longest, steps, got = (
+            proxy.max_steps(spec.max_steps),
+            training.max_steps,
+            training.solved_by,
+        )
+        require_reachable(group, training, longest)
+        field = f"{group}.solved_by"
+        message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
+        require(training.stop_rule != "solved" or got == "test", field, message)
+        before = self.agents[key].steps_before_learning(longest, spec.max_steps)
+        message = (
+            f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
+        )
+        is_enough = not proxy.reaches_step_limit or steps is None or steps > before
+        field = f"{group}.max_steps"
+        require(is_enough, field, f"{message} Set {field}={4 * before}.")
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
@@ -153,20 +197,16 @@ class LearnConfig(CommandConfig):
         registry.require_package("tracker", self.tracker)
         registry.require_package("machines", self.machines)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
-        message = (
-            f"must be left out with other machines; got {self.devices}. Set machines.workers=N."
-        )
+        message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
         is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
         message = f"must be false with objective={self.name('objective')}, whose scores are no"
         require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
-        if not self.proxy.has_real_dynamics:
-            require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
         for key in self.agents:
-            require_fit(self, key, spec, task_name)
-            require_learning(self, key, "training", self.training, self.proxy, spec)
+            self.require_fit(key, spec, task_name)
+            self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
@@ -251,58 +291,8 @@ class EvaluateConfig(CommandConfig):
         default, training = to_plain(TRAINING), to_plain(self.training).items()
         changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
         fix = "" if self.proxy == "real" else "training_from=config, or "
-        message = (
-            f"must be left out, as it says nothing here; got {changed}. Set {fix}real_training.*."
-        )
+        message = f"must be left out, as it is idle here; got {changed}. Set {fix}real_training.*."
         require(self.training_from == "config" or not changed, "training", message)
-
-
-# --- what must hold of an agent -------------------------------------------------------------------
-
-
-def require_fit(config: CommandConfig, key: str, spec: TaskSpec, task_name: str) -> None:
-    """Checks that one of a configuration's agents can act in a task.
-
-    Raises:
-      ConfigError: if it cannot.
-    """
-    with errors_of("agent", field_of(key, config.agents)):
-        agents.require_fit(config.agents[key], config.exploration, spec, task_name)
-
-
-def require_learning(
-    config: CommandConfig,
-    key: str,
-    group: str,
-    training: TrainingConfig,
-    proxy: ProxyConfig,
-    spec: TaskSpec,
-) -> None:
-    """Checks that an agent learns something on a proxy.
-
-    Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a step
-    budget must let it learn. What stops it must not read the proxy's returns.
-
-    Args:
-      config: of the command.
-      key: of the agent.
-      group: of the fields of its training.
-      training: how long it trains.
-      proxy: the proxy's configuration.
-      spec: of the real task.
-
-    Raises:
-      ConfigError: if it does not.
-    """
-    field, got = f"{group}.solved_by", training.solved_by
-    message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
-    require(training.stop_rule != "solved" or got == "test", field, message)
-    field, steps = f"{group}.max_steps", training.max_steps
-    limits = proxy.max_steps(spec.max_steps), spec.max_steps
-    before = config.agents[key].steps_before_learning(*limits)
-    message = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
-    is_enough = not proxy.reaches_step_limit or steps is None or steps > before
-    require(is_enough, field, f"{message} Set {field}={4 * before}.")
 
 
 # --- plain values ---------------------------------------------------------------------------------
@@ -478,9 +468,7 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     if source == "real":
         return {}
     field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
-    message = (
-        f"must be left out with agent_hparams=as_learned; got {got}. Set agent_hparams=default."
-    )
+    message = f"must be left out with agent_hparams=as_learned; got {got}. Set it to default."
     require(not words or hparams != "as_learned", field, message)
     stored, learned = None, dict[str, Any]()
     try:

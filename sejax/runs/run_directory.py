@@ -5,10 +5,9 @@ It holds the configuration, the state of the learner, and all rows of `metrics.c
 changes nothing.
 """
 
-import json
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -154,10 +153,6 @@ class RunDirectory(Store):
         else:
             write_text(self.path / _METRICS, csv)
         return new
-
-    def write_summary(self, **values: Any) -> None:
-        """Writes `run.json`."""
-        write_text(self.path / "run.json", json.dumps(values, indent=2) + "\n")
 
     def _as_csv(self, rows: Iterable[Mapping[str, str]]) -> str:
         """The text of `metrics.csv`, none of whose cells has a comma."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import platform
 import signal
 import threading
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 
 from sejax.bilevel import Bilevel, LearnState
+from sejax.ops.files import write_text
 from sejax.proxies.header import agents_of
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
@@ -29,7 +31,7 @@ PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "nump
 
 def run(
     config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
-) -> str:
+) -> dict[str, Any]:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
     Args:
@@ -39,8 +41,8 @@ def run(
       report: hears how it goes on.
 
     Returns:
-      How it ended: finished, solved, or diverged: a run of whose agents none has ended with finite
-      numbers stops, and has no proxy.
+      What `run.json` holds. `ended` is finished, solved, or diverged: a run of whose agents none
+      has ended with finite numbers stops, and has no proxy.
 
     Raises:
       ConfigError: if the folder's state is that of another version.
@@ -74,21 +76,22 @@ def run(
         draw(directory, learner)
     generations, agents = directory.finished_generations, learner.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
-    directory.write_summary(
-        ended=ended,
-        best_score=float(state.best_score),
-        solved_score=learner.solved_score,
-        wall_s=round(start_wall_s + time.monotonic(), 1),
-        cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
-        generations=generations,
-        agents=generations * agents,
-        train_steps=round(steps * agents),
-        real_steps=int(directory.last("env_steps_total")),
-        devices=[str(device) for device in jax.devices()],
-        machine=runtime.machine(),
-        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
-    )
-    return ended
+    summary = {
+        "ended": ended,
+        "best_score": float(state.best_score),
+        "solved_score": learner.solved_score,
+        "wall_s": round(start_wall_s + time.monotonic(), 1),
+        "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
+        "generations": generations,
+        "agents": generations * agents,
+        "train_steps": round(steps * agents),
+        "real_steps": int(directory.last("env_steps_total")),
+        "devices": [str(device) for device in jax.devices()],
+        "machine": runtime.machine(),
+        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
+    }
+    write_text(directory.path / "run.json", json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
 def _begin(

@@ -111,12 +111,12 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
             run_dir = str(folder if len(seeds) == 1 else folder / f"seed{seed}")
             one = dataclasses.replace(config, seed=seed, generations=generations, run_dir=run_dir)
             with RunDirectory(one, "Set search_dir=FOLDER.") as directory:
-                ends.append(session.run(one, directory, chunks))
+                summary = session.run(one, directory, chunks)
+            ends.append(summary["ended"])
+            train_steps += summary["train_steps"]
             of_run = [float(row["incumbent_mean"]) for row in directory.rows[:generations]]
             computed.append(len(of_run))
             means.append(of_run + of_run[-1:] * (generations - len(of_run)))
-            steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
-            train_steps += round(steps * chunks.learner.strategy.num_evaluations)
         scores = np.mean(means, axis=0)
         scores[~np.isfinite(scores)] = np.nan
         return Progress(scores, train_steps, float(np.mean(computed)), set(ends) == {"solved"})
