@@ -54,9 +54,8 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
       {'env': 'acrobot', 'agents': '[ddqn,ppo]'}
     """
     is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
-    got = shortened(repr(overrides))
-    message = f'must be a list of text; got {got}. Set overrides=["env=cartpole"].'
-    require(is_list, "overrides", message)
+    message = f"must be a list of text; got {shortened(overrides)}."
+    require(is_list, "overrides", f'{message} Set overrides=["env=cartpole"].')
     texts = {}
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
@@ -76,14 +75,13 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
 
 def meant(overrides: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
-    name, *values = [*filter(None, (word.strip("-=") for word in overrides[:3])), *["VALUE"] * 2]
-    if "=" in name:  # after dashes
-        return shortened(name)
-    value = "VALUE" if "=" in values[0] else values[0]
-    is_field = overrides[0].startswith("-") or name in registry.GROUPS or value != "VALUE"
-    if is_field and NAME.fullmatch(name) and not registry.is_registered("env", name):
-        return f"{shortened(name)}={shortened(value)}"
-    return f"env={shortened(name)} or proxy={shortened(name)}, if that is meant"
+    pattern = r"([-=\s]*)([^\s=]*)(?:[\s=]+([^\s=]+)(?!\S))?"
+    dashes, name, value = re.findall(pattern, " ".join(overrides[:3]))[0]
+    is_field = NAME.fullmatch(name) and not registry.is_registered("env", name)
+    if is_field and (dashes or value or name in registry.GROUPS):
+        return f"{shortened(name)}={shortened(value or 'VALUE')}"
+    name = shortened(name or "NAME")
+    return f"env={name} or proxy={name}, if that is meant"
 
 
 def read(overrides: Sequence[str]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from sejax.options import registry, told
+from sejax.options.parts import Makes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,7 @@ class Tracker(Protocol):
 class GuardedTracker:
     """The tracker of a run, made at its first generation, dropped with one message if it raises."""
 
-    def __init__(self, config: Any, run: TrackedRun, say: Callable[[str], None]):
+    def __init__(self, config: Makes[Tracker], run: TrackedRun, say: Callable[[str], None]):
         """The tracker of a configuration; `say` takes the message."""
         self._config, self._run, self._say = config, run, say
         self._tracker: Tracker | None = None

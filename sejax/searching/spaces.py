@@ -23,8 +23,9 @@ from typing import Any
 import yaml
 from optuna import distributions
 
-from sejax.options import ConfigError, as_text, nearest, require, shortened, told
+from sejax.options import ConfigError, as_text, is_number, nearest, require, shortened, told
 from sejax.options.plain import split
+from sejax.runs.preset_files import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -60,12 +61,12 @@ class Dimension:
             value = f"{1 - value if self.is_inverse else value:.{DIGITS}g}"
         return str(value)
 
-    def parameter_of(self, value: Any) -> Any:
+    def parameter_of(self, value: float | str | None) -> float | str | None:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
         try:
             if isinstance(self.distribution, distributions.CategoricalDistribution):
                 value = as_text(value)
-            elif self.is_inverse:
+            elif self.is_inverse and is_number(value):
                 value = round(1 - value, 12)
             is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
         except (TypeError, ValueError):
@@ -148,14 +149,7 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
             for field, text in with_agent.get(agent, {}).items():
                 if group == "agent" or field.startswith("agent."):
                     texts[field.replace("agent", group, 1)] = text
-    except (
-        OSError,
-        yaml.YAMLError,
-        AttributeError,
-        TypeError,
-        ValueError,
-        RecursionError,
-    ) as error:
+    except UNREADABLE as error:
         must = f"must be one of {', '.join(nearest(name, names()))}, or a YAML file of ranges"
         got = f"{shortened(name)} ({told(error)[:120]})"
         raise ConfigError(f"space {must}; got {got}. Set space=paper_se.", "space") from error
