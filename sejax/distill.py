@@ -27,7 +27,7 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Options, counts, field_lines, help_texts, option, require, shortened
+from sejax.options import Options, counts, field_lines, option, require, shortened
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -93,10 +93,8 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    texts = help_texts(DistillConfig)
-    for group, part in {"copy": CopyConfig, "search": SearchConfig}.items():
-        texts |= {f"{group}.{name}": text for name, text in help_texts(part).items()}
-    lines = field_lines(flatten(to_plain(DistillConfig())), texts)
+    classes = [("", DistillConfig), ("copy", CopyConfig), ("search", SearchConfig)]
+    lines = field_lines(flatten(to_plain(DistillConfig())), classes)
     return f"{__doc__}\nIts own fields, with their defaults:\n{lines}"
 
 

@@ -12,7 +12,7 @@ python -m sejax.run.
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from sejax.options import ConfigError, field_lines, help_texts, require, told
+from sejax.options import ConfigError, field_lines, require, told
 from sejax.options.plain import to_plain
 from sejax.runs import commands, runtime
 
@@ -48,7 +48,7 @@ def help_text(overrides: Sequence[str]) -> str:
     require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
     from sejax.searching.config import SearchConfig
 
-    lines = field_lines(to_plain(SearchConfig()), help_texts(SearchConfig))
+    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)])
     return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 

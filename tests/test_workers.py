@@ -25,6 +25,7 @@ def require_equal_numbers(words, generations):
 
     remote = RemoteChunks(config, compute)
     local = Chunks(remote.learner)
+    local.compile(1)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))
     for _ in range(generations):
         state, info = local.advance(state, 1)

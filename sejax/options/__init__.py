@@ -220,15 +220,19 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
 
 def field_lines(
-    values: Mapping[str, Any], texts: Mapping[str, str], sources: Mapping[str, str] | None = None
+    values: Mapping[str, Any],
+    classes: Iterable[tuple[str, type]],
+    sources: Mapping[str, str] | None = None,
 ) -> str:
     """Lines of `--help`: each field with its value, its text, and where its value comes from.
 
     Args:
       values: plain values by the fields' names.
-      texts: from `help_texts`, by the same names.
+      classes: groups of fields, each with a class whose docstring has their texts.
       sources: what stands behind a field's text, such as the layer that its value is from.
     """
+    of_groups = ((group, help_texts(cls).items()) for group, cls in classes)
+    texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
     lines = []
     for name, value in values.items():
         about = f"  # {texts[name]}" if name in texts else ""

@@ -37,15 +37,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from sejax.options import (
-    ConfigError,
-    Options,
-    place_of,
-    require,
-    shortened,
-    told,
-    unknown_name,
-)
+from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
 if TYPE_CHECKING:
@@ -142,10 +134,7 @@ BUILT_IN = {
         "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
         "wandb": "sejax.runs.trackers:WandbConfig",
     },
-    "machines": {
-        "local": "sejax.runs.workers:LocalConfig",
-        "ray": "sejax.runs.workers:RayConfig",
-    },
+    "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
 }
 # Beginnings of a task's name: a dataclass with a field `name`.
 PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"}

@@ -197,9 +197,7 @@ def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
 
 
 def compose(
-    schema: "type[CommandConfig]",
-    overrides: Sequence[str],
-    stored: Mapping[str, Any] | None = None,
+    schema: "type[CommandConfig]", overrides: Sequence[str], stored: Mapping[str, Any] | None = None
 ) -> tuple[Layers, frozenset[str]]:
     """Composes a command's words over its preset and its choices.
 
@@ -246,15 +244,15 @@ def _nested(
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
     for name, value in given.items():
+        group, _, field = name.partition(".")
         if name in (*groups, "agent", "agents"):
             continue
-        first, *path = name.split(".")
-        if first == "agent":
-            key, got = next(iter(agents)), shortened(value)
-            message = f"must be one agent's; got {got}. Set agents.{key}{name[5:]}={got}."
-            require(len(agents) == 1, name, message)
-            first, *path = "agents", key, *path
-        for part in reversed(path):
+        if group == "agent":
+            full, got = f"agents.{next(iter(agents))}.{field}", shortened(value)
+            is_clear = len(agents) == 1
+            require(is_clear, name, f"must be one agent's; got {got}. Set {full}={got}.")
+            name = full
+        for part in reversed(name.split(".")):
             value = {part: value}
-        tree = merge(tree, {first: value})
+        tree = merge(tree, value)
     return tree

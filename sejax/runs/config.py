@@ -24,7 +24,6 @@ from sejax.options import (
     counts,
     errors_of,
     field_lines,
-    help_texts,
     one_of,
     option,
     registry,
@@ -32,17 +31,10 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import (
-    fields_of,
-    flatten,
-    from_plain,
-    merge,
-    to_plain,
-    unknown_field,
-)
+from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
 from sejax.runs import preset_files
-from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, read
+from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, read
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -356,8 +348,7 @@ def _from_plain(
     for key in keys:
         where, agent = field_of(shortened(key, 40), keys), several[key]
         agent = dict(agent) if isinstance(agent, Mapping) else {}
-        is_shared = schema.learns and "weight" in agent
-        share = {"weight": agent.pop("weight")} if is_shared else {}
+        share = {k: agent.pop(k) for k in fields_of(Share) if schema.learns and k in agent}
         weights.append(from_plain(Share, share, where).weight)
         with errors_of("agent", where):
             objects["agents"][key] = registry.configure("agent", agent, imports)
@@ -391,16 +382,21 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    layers, imports = compose(LearnConfig, overrides)
-    return _from_plain(LearnConfig, merge(*layers.values()), imports)
+    return _composed(LearnConfig, overrides)[0]
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    layers, imports = compose(EvaluateConfig, overrides, _learned(read(overrides)))
     message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-    require("proxy" in layers["typed"], "proxy", message)
-    return _from_plain(EvaluateConfig, merge(*layers.values()), imports)
+    require("proxy" in read(overrides), "proxy", message)
+    return _composed(EvaluateConfig, overrides)[0]
+
+
+def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:
+    """A command's configuration of its words, and the layers that it comes from."""
+    stored = {} if schema.learns else _learned(read(overrides))
+    layers, imports = compose(schema, overrides, stored)
+    return _from_plain(schema, merge(*layers.values()), imports), layers
 
 
 def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
@@ -410,8 +406,7 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
     layer beside it that it comes from.
     """
     words = overrides if schema.learns else ["proxy=RUN_DIR", *overrides]
-    layers, imports = compose(schema, words, {} if schema.learns else _learned(read(words)))
-    config = _from_plain(schema, merge(*layers.values()), imports)
+    config, layers = _composed(schema, words)
     lines = ["Choices (group=choice):"]
     for group in ("agent", *schema.groups):
         prefixes = [f"{start}ID" for start in registry.PREFIXES] if group == "env" else []
@@ -421,21 +416,17 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
     if schema.learns:
         lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
-    classes = {name: type(x) for name, x in vars(config).items()}
-    classes |= {field_of(key, config.agents): type(x) for key, x in config.agents.items()}
-    classes |= {"": schema, "agents": MixtureConfig}
+    classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
+    classes += [(name, type(x)) for name, x in vars(config).items()]
+    for key, agent in config.agents.items():
+        classes += [(field_of(key, config.agents), cls) for cls in (Share, type(agent))]
     sources = dict[str, str]()
     for layer, values in layers.items():
         names = flatten(_as_words(values, config.agents))
         sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
-    fields, texts = words_of(config), dict[str, str]()
-    choices = {name.removesuffix(".name") for name in fields if name.endswith(".name")}
-    fields = {k: x for k, x in fields.items() if k.removesuffix(".name") not in choices}
-    for name in fields:
-        group, _, field = name.rpartition(".")
-        of_group = help_texts(Share) | help_texts(classes.get(group, Share))
-        texts |= {name: of_group[field]} if field in of_group else {}
-    return "\n".join([*lines, field_lines(fields, texts, sources)])
+    values = flatten(_as_words(plain(config), config.agents))
+    fields = {name: x for name, x in values.items() if not name.endswith(".name")}
+    return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:

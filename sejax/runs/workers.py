@@ -71,13 +71,11 @@ class Chunks:
         self.compiled[length] = jitted.lower(state).compile()
 
     def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations; the buffers of the state are donated.
+        """Runs `length` generations, after `compile`; the buffers of the state are donated.
 
         Returns:
           The state, and an info with leaves `[length, ...]`.
         """
-        if length not in self.compiled:
-            self.compile(length)
         state, info = self.compiled[length](state)
         return state, info
 
