@@ -60,6 +60,9 @@ class EvosaxConfig(StrategyOptions):
             f"must be even; got {shortened(self.population_size)}. Set "
             f"es.population_size={self.population_size + 1}.",
         )
+        is_used = ALGORITHMS[self.name][2] == "adam" or self.step_size == EvosaxConfig.step_size
+        message = f"must be left out with es={self.name}, where it is idle; got {self.step_size}."
+        require(is_used, "es.step_size", f"{message} Leave it out.")
 
     def make(self, num_dims: int) -> Strategy:
         """The algorithm over vectors of `num_dims` numbers."""

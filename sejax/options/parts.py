@@ -27,20 +27,20 @@ class RunConfig(Protocol):
     def parts(self) -> dict[str, Any]: ...
 
 
-def make_part(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
+def make_part(group: str, cls: type[T], part: T | Makes[T], *arguments: Any) -> T:
     """The part itself.
 
     Args:
       group: the field that it is given as.
       cls: its class.
       part: the part, or its configuration.
-      argument: of `Makes.make`.
+      *arguments: of `Makes.make`.
 
     Raises:
       ConfigError: for anything else.
     """
     if not isinstance(part, cls) and isinstance(part, Makes):
-        part = registry.make(group, part, argument)
+        part = registry.make(group, part, *arguments)
     return require_part(group, cls, part)
 
 

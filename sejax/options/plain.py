@@ -36,6 +36,8 @@ MISSING = dataclasses.MISSING
 # without them.
 GONE = {"torso": None, "num_filters": 16, "loss": "squared", "compared_by": "advantage"}
 GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
+# Fields by the names that others give them.
+SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
 
@@ -116,7 +118,8 @@ def fields_of(cls: type) -> dict[str, Any]:
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """Error for a field that is not there, with the nearest of those that are."""
     field, last = shortened(field, 40), field.rpartition(".")[2]
-    ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
+    meant = SYMBOLS.get(last, last)
+    ranked = [name for name in known if name.rpartition(".")[2] == meant] or nearest(field, known)
     fix = f" Did you mean {ranked[0]}?" if ranked else ""
     is_no = "is no field any more" if last in GONE else "is no field"
     return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)

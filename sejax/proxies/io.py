@@ -107,7 +107,7 @@ class Proxy(_Loaded):
         return fingerprint(self.params.weights)
 
 
-def fingerprint(weights: Any) -> str:
+def fingerprint(weights: PyTree) -> str:
     """Eight hexadecimal digits that tell nested weights from others."""
     flat = _flatten(weights)
     content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))

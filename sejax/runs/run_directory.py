@@ -51,7 +51,7 @@ class RunDirectory(Store):
 
     Args:
       config: of the run.
-      hint: last sentence of messages: how to choose another folder.
+      field: the field that names the folder, for messages.
 
     Attributes:
       path: the folder; made, or that of an earlier session of the same run.
@@ -63,11 +63,11 @@ class RunDirectory(Store):
       versions: of the packages that decide the numbers, as the checkpoint was written.
     """
 
-    def __init__(self, config: LearnConfig, hint: str = ""):
+    def __init__(self, config: LearnConfig, field: str = "run_dir"):
         super().__init__(
             config.resolved_run_dir,
             configuration.plain(config),
-            hint=hint,
+            field=field,
             free=FREE_FIELDS,
             completed=lambda stored: configuration.completed(stored, config),
         )

@@ -110,7 +110,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
         for seed in (config.seed + offset for offset in seeds):
             run_dir = str(folder if len(seeds) == 1 else folder / f"seed{seed}")
             one = dataclasses.replace(config, seed=seed, generations=generations, run_dir=run_dir)
-            with RunDirectory(one, "Set search_dir=FOLDER.") as directory:
+            with RunDirectory(one, "search_dir") as directory:
                 summary = session.run(one, directory, chunks)
             ends.append(summary["ended"])
             train_steps += summary["train_steps"]
