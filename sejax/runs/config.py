@@ -409,7 +409,7 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
     config, layers = _composed(schema, words)
     lines = ["Choices (group=choice):"]
     for group in ("agent", *schema.groups):
-        prefixes = [f"{start}ID" for start in registry.PREFIXES] if group == "env" else []
+        prefixes = ["gymnax/ID"] if group == "env" else []
         known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]

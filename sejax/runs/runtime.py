@@ -88,28 +88,15 @@ def configure_jax() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def machine() -> dict[str, str | int]:
-    """What kind of machine this is; not which."""
-    models = [x.partition(":")[2].strip() for x in _cpu_lines() if x.startswith("model name")]
-    return {
-        "system": f"{platform.system()} {platform.release()}",
-        "processor": models[0] if models else platform.processor() or platform.machine(),
-        "cores": available_cores(),
-    }
-
-
 def cpu_fingerprint() -> str:
     """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
-    fields = ("model name", "flags", "Features")
-    lines = sorted({x for x in _cpu_lines() if x.startswith(fields)}) or [platform.processor()]
+    lines = [platform.processor()]
+    with contextlib.suppress(OSError):
+        of_cores = Path("/proc/cpuinfo").read_text().splitlines()
+        fields = ("model name", "flags", "Features")
+        lines = sorted({x for x in of_cores if x.startswith(fields)}) or lines
     digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
     return f"{platform.machine()}-{digest}"
-
-
-def _cpu_lines() -> list[str]:
-    with contextlib.suppress(OSError):
-        return Path("/proc/cpuinfo").read_text().splitlines()
-    return []
 
 
 def versions() -> dict[str, str]:

@@ -87,7 +87,7 @@ def run(
         "train_steps": round(steps * agents),
         "real_steps": int(directory.last("env_steps_total")),
         "devices": [str(device) for device in jax.devices()],
-        "machine": runtime.machine(),
+        "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
         "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     }
     write_text(directory.path / "run.json", json.dumps(summary, indent=2) + "\n")
