@@ -216,11 +216,8 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The objects that it describes, as `sejax.make_learner` takes them."""
-        task, is_varied = self.task(), self.agent_hparams == "varied"
-        learners = tuple(
-            agents.make_agent(agent, task, self.exploration, is_varied)
-            for agent in self.agents.values()
-        )
+        task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
+        learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
         names, weights = tuple(self.agents), self.weights
         several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
