@@ -162,8 +162,10 @@ class RunDirectory(Store):
     def _open(self) -> None:
         """Takes over what the checkpoint holds, if there is one."""
         entry = self.get(_CHECKPOINT)
-        if entry is None:
-            self._require_no_other_run()
+        if entry is None:  # then neither a run without its checkpoint, nor one of an older sejax
+            for name in filter(lambda name: (self.path / name).exists(), _SIGNS_OF_A_RUN):
+                must = "must be new or hold the checkpoint of its run"
+                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
             return
         tensors, values = entry
         try:
@@ -177,13 +179,6 @@ class RunDirectory(Store):
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = tensors
-
-    def _require_no_other_run(self) -> None:
-        """Refuses to replace the files of a run without its checkpoint, or of an older sejax."""
-        for name in _SIGNS_OF_A_RUN:
-            if (self.path / name).exists():
-                must = "must be new or hold the checkpoint of its run"
-                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a block."""

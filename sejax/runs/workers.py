@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.generation import Candidates, Trainings
+from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import ConfigError, FailedError, Options, counts, option, shortened, told
@@ -195,8 +195,9 @@ class RemoteChunks(Chunks):
 
         def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
             candidates = learner.ask(state)
-            outcome = learner.evaluate.joined(by_agent)
-            return learner.tell(state, candidates, outcome), _sent(learner, candidates)
+            trainings = learner.evaluate.trainings(candidates)
+            sent = [dataclasses.replace(x, key=jax.random.key_data(x.key)) for x in trainings]
+            return learner.tell(state, candidates, learner.evaluate.joined(by_agent)), sent
 
         def evaluate(state: LearnState) -> list[Outcome]:
             trainings = learner.evaluate.trainings(learner.ask(state))
@@ -239,14 +240,6 @@ class RemoteChunks(Chunks):
             parts[agent].append(outcome)
             self.cpu_s += cpu_s
         return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
-
-
-def _sent(learner: Bilevel, candidates: Candidates) -> list[Trainings]:
-    """The trainings of each agent, with keys as data."""
-    return [
-        dataclasses.replace(trainings, key=jax.random.key_data(trainings.key))
-        for trainings in learner.evaluate.trainings(candidates)
-    ]
 
 
 # --- the cluster ----------------------------------------------------------------------------------

@@ -125,11 +125,6 @@ def _distribution(text: str, tags: list[str]) -> distributions.BaseDistribution:
     raise ValueError("bounds, tags or values are wrong")
 
 
-def names() -> list[str]:
-    """The presets."""
-    return sorted(file.stem for file in FOLDER.glob("*.yaml"))
-
-
 def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     """The dimensions of a preset, or of a file of your own.
 
@@ -150,7 +145,8 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
                 if group == "agent" or field.startswith("agent."):
                     texts[field.replace("agent", group, 1)] = text
     except UNREADABLE as error:
-        must = f"must be one of {', '.join(nearest(name, names()))}, or a YAML file of ranges"
+        known = nearest(name, (file.stem for file in FOLDER.glob("*.yaml")))
+        must = f"must be one of {', '.join(known)}, or a YAML file of ranges"
         got = f"{shortened(name)} ({told(error)[:120]})"
         raise ConfigError(f"space {must}; got {got}. Set space=paper_se.", "space") from error
     foreign = [text for text in texts.values() if ":" in str(text)]
