@@ -14,16 +14,13 @@ import itertools
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from sejax import agents, envs
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, as_text, registry, require, shortened
+from sejax.options import ConfigError, Options, as_text, registry, require, shortened
 from sejax.options.plain import expanded, merge, parsed, split, unquoted
 from sejax.runs import preset_files
-
-if TYPE_CHECKING:
-    from sejax.runs.config import CommandConfig
 
 # Choices where neither a word nor the task or the proxy makes one.
 DEFAULTS = {
@@ -37,7 +34,7 @@ DEFAULTS = {
 }
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 Layers = dict[str, Mapping[str, Any]]
-Config = TypeVar("Config", bound="CommandConfig")
+Config = TypeVar("Config", bound=Options)
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -197,13 +194,14 @@ def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
 
 
 def compose(
-    schema: "type[CommandConfig]", overrides: Sequence[str], stored: Mapping[str, Any] | None = None
+    overrides: Sequence[str], groups: Collection[str], learns: bool, stored: Mapping[str, Any]
 ) -> tuple[Layers, frozenset[str]]:
     """Composes a command's words over its preset and its choices.
 
     Args:
-      schema: the command's configuration.
       overrides: as typed after the command.
+      groups: of plugins whose choices are the command's fields.
+      learns: whether presets have settings.
       stored: what a stored proxy was learned with, nested plain values.
 
     Returns:
@@ -213,16 +211,16 @@ def compose(
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given, stored = read(overrides), stored or {}
+    given = read(overrides)
     imports = frozenset(registry.paths_in(overrides))
-    usual = DEFAULTS | {group: stored[group]["name"] for group in schema.groups if group in stored}
-    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in schema.groups}
+    usual = DEFAULTS | {group: stored[group]["name"] for group in groups if group in stored}
+    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in groups}
     names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = _default_agent(given, imports)
         names = {default: default}
     preset, of_preset = str(given.get("preset", "best")), {}
-    if schema.learns:
+    if learns:
         section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
         objective = registry.find("proxy", chosen["proxy"], imports).default_objective
         objective = section.get("objective", {}).get("name", objective)
@@ -233,7 +231,7 @@ def compose(
         "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
         f"preset={preset}": of_preset,
         "proxy": stored,
-        "typed": _nested(given, names, schema.groups),
+        "typed": _nested(given, names, groups),
     }
     return layers, imports
 

@@ -392,7 +392,7 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
 def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:
     """A command's configuration of its words, and the layers that it comes from."""
     stored = {} if schema.learns else _learned(read(overrides))
-    layers, imports = compose(schema, overrides, stored)
+    layers, imports = compose(overrides, schema.groups, schema.learns, stored)
     return _from_plain(schema, merge(*layers.values()), imports), layers
 
 

@@ -79,8 +79,8 @@ class RunProgress(Progress, Reporter):
         if solved_score is not None:
             verdict = "solved" if is_solved else "not solved"
             verdict += f": best incumbent mean {best:.1f}, solved at {solved_score:g}"
-        title = "solved" if is_solved else "learned"
-        self.console.rule(f"{learner.proxy.task.name}: {title}", align="left")
+        ending = "solved" if is_solved else "learned"
+        self.console.rule(f"{learner.proxy.task.name}: {ending}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"

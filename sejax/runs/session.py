@@ -16,7 +16,6 @@ import numpy as np
 
 from sejax.bilevel import Bilevel, LearnState
 from sejax.ops.files import write_text
-from sejax.proxies.header import agents_of
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
@@ -71,9 +70,9 @@ def run(
                     report.on_generation(generation)
                     tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
-                draw(directory, learner)
+                draw(config, directory, learner)
                 drawn = time.monotonic()
-        draw(directory, learner)
+        draw(config, directory, learner)
     generations, agents = directory.finished_generations, learner.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     summary = {
@@ -208,12 +207,11 @@ def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, f
         )
 
 
-def draw(directory: RunDirectory, learner: Bilevel) -> None:
+def draw(config: LearnConfig, directory: RunDirectory, learner: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
-        path, config = directory.path / "learning_curve.png", directory.config
-        title = f"{config['env']['name']}, {str(config['proxy']['name']).upper()}, "
-        title += " + ".join(agent["name"] for agent in agents_of(config).values())
+        path = directory.path / "learning_curve.png"
+        title = ", ".join(map(config.name, ("env", "proxy", "agent")))
         plots.learning_curve(directory.rows, learner.solved_score, path, title)
 
 
