@@ -48,7 +48,7 @@ def help_text(overrides: Sequence[str]) -> str:
     require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
     from sejax.searching.config import SearchConfig
 
-    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)])
+    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)], {})
     return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 

@@ -220,9 +220,7 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
 
 def field_lines(
-    values: Mapping[str, Any],
-    classes: Iterable[tuple[str, type]],
-    sources: Mapping[str, str] | None = None,
+    values: Mapping[str, Any], classes: Iterable[tuple[str, type]], sources: Mapping[str, str]
 ) -> str:
     """Lines of `--help`: each field with its value, its text, and where its value comes from.
 
@@ -236,7 +234,7 @@ def field_lines(
     lines = []
     for name, value in values.items():
         about = f"  # {texts[name]}" if name in texts else ""
-        line = f"  {name}={as_text(value)}{about}{(sources or {}).get(name, '')}"
+        line = f"  {name}={as_text(value)}{about}{sources.get(name, '')}"
         lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
     return "\n".join(lines)
 
