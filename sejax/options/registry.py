@@ -165,6 +165,8 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
       ConfigError: for an unknown name, a module that cannot or may not be imported, or an
         attribute that is no plugin.
     """
+    if name in BUILT_IN[group]:
+        return _attribute(BUILT_IN[group][name])
     path = _path_of(group, name)
     if path is None and ":" in name:
         path = name

@@ -168,9 +168,8 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in given]:
-        names = parsed(given[field]) if isinstance(given[field], str) else given[field]
-        names = names if isinstance(names, list) else [names]
-        names = [x if isinstance(x, str) else as_text(x) for x in names]
+        names = parsed(str(given[field]))
+        names = [*map(as_text, names if isinstance(names, list) else [names])]
         several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
         is_clear = names and not chosen and len({*names}) == len(names)
         message = f"must name each agent once; got {shortened(given[field])}. Set agents="

@@ -185,7 +185,6 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        seed()("seed + num_seeds - 1", self.seed + self.num_seeds - 1, 0)
         registry.require_package("tracker", self.tracker)
         registry.require_package("machines", self.machines)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
