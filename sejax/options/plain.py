@@ -20,13 +20,11 @@ from sejax.options import (
     ConfigError,
     as_text,
     errors_of,
-    is_number,
     listed,
     marks,
     nearest,
     require,
     shortened,
-    told,
 )
 
 T = typing.TypeVar("T")
@@ -75,9 +73,8 @@ def from_plain(
     try:
         hints = typing.get_type_hints(cls)
     except NameError as error:
-        raise ConfigError(
-            f"{where} must have fields of known types: {told(error)}.", where
-        ) from error
+        message = f"{where} must have fields of known types: {error}."
+        raise ConfigError(message, where) from error
     defaults, fields = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
@@ -138,7 +135,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
     candidates = [value]
     if isinstance(value, str):
         candidates = [parsed(expanded(value)), expanded(value)]
-    elif is_number(value):  # or a name of digits, as of a folder
+    elif type(value) in (int, float):  # or a name of digits, as of a folder
         candidates = [value, str(value)]
     must = "be no true or false"
     for candidate in candidates:
