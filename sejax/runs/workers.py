@@ -93,7 +93,6 @@ class LocalConfig(Options):
     """This process computes everything: one compiled program over its devices."""
 
     group: ClassVar[str] = "machines"
-    is_elsewhere: ClassVar[bool] = False
 
     def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
         """The compiled generations of a run."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from sejax import envs
 from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, registry, require
+from sejax.options import registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs.config import EvaluateConfig
@@ -38,9 +38,8 @@ class Setup(NamedTuple):
 
 def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
-    if config.env is None:
-        raise ConfigError("env must be given with proxy=real. Set env=cartpole.", "env")
-    task = envs.make(config.env)
+    require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
+    task = envs.make(str(config.env))
     for key in config.agents:
         config.require_fit(key, task, task.name)
     trainings = dict.fromkeys(config.agents, config.real_training)
