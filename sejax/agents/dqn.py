@@ -17,13 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    FlatNetwork,
-    OffPolicy,
-    OffPolicyOptions,
-    adam_step,
-    soft_update,
-)
+from sejax.agents.off_policy import FlatNetwork, OffPolicy, OffPolicyOptions, adam_step, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
 from sejax.ops import cpu, flat

@@ -16,13 +16,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
-from sejax.agents.buffers import (
-    BufferMaker,
-    Transition,
-    num_columns,
-    replay_buffer,
-    sum_over_batch,
-)
+from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops import flat
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
@@ -75,11 +69,7 @@ class OffPolicyOptions(AgentOptions):
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
         return MLP(
-            num_outputs,
-            self.hidden_size,
-            self.num_layers,
-            self.activation,
-            learn_prelu_slope=True,
+            num_outputs, self.hidden_size, self.num_layers, self.activation, learn_prelu_slope=True
         )
 
 
