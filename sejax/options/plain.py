@@ -32,8 +32,8 @@ T = typing.TypeVar("T")
 MISSING = dataclasses.MISSING
 # Fields of earlier versions, with the only value that a file may still give them: what is computed
 # without them.
-GONE = {"torso": None, "num_filters": 16, "loss": "squared", "compared_by": "advantage"}
-GONE |= {"reward_slope": 1.0, "horizon_is_terminal": True}
+GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
+GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
 GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
 # Fields by the names that others give them.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
