@@ -27,8 +27,8 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Options, as_text, counts, help_texts, option, require, shortened
-from sejax.options.plain import fields_of, from_plain, merge, to_plain
+from sejax.options import Options, counts, field_lines, option, require, shortened
+from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -82,25 +82,20 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides that cannot be, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    own, config = read(overrides)
+    job, config = read(overrides)
     runtime.configure_jax()
-    folder = folder_of(own, config)
+    folder = folder_of(job, config)
     try:
-        distill(own, config, folder, shlex.join(overrides))
+        distill(job, config, folder, shlex.join(overrides))
     except KeyboardInterrupt as stop:
         commands.interrupted(f"Interrupted. The same command goes on from {folder}.", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    parts = {"": DistillConfig, "copy.": CopyConfig, "search.": SearchConfig}
-    lines = [
-        f"  {prefix}{name}={as_text(default)}  # {help_texts(part).get(name, '')}".rstrip(" #")
-        for prefix, part in parts.items()
-        for name, default in fields_of(part).items()
-        if name not in ("copy", "search")
-    ]
-    return "\n".join([str(__doc__), "Its own fields, with their defaults:", *lines])
+    classes = [("", DistillConfig), ("copy", CopyConfig), ("search", SearchConfig)]
+    lines = field_lines(flatten(to_plain(DistillConfig())), classes, {})
+    return f"{__doc__}\nIts own fields, with their defaults:\n{lines}"
 
 
 def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
@@ -134,9 +129,9 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     return from_plain(DistillConfig, merge(bonus, values), ""), config
 
 
-def folder_of(own: DistillConfig, config: LearnConfig) -> Path:
+def folder_of(job: DistillConfig, config: LearnConfig) -> Path:
     """The command's folder: `run_dir`, or one named by task, given policy and seed."""
-    algorithm, _, path = (own.policy or "").rpartition(":")
+    algorithm, _, path = (job.policy or "").rpartition(":")
     parts = ["distill", config.name("env"), algorithm, Path(path).stem, f"s{config.seed}"]
     return Path(config.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
 
@@ -144,11 +139,11 @@ def folder_of(own: DistillConfig, config: LearnConfig) -> Path:
 # --- what the command does ------------------------------------------------------------------------
 
 
-def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
+def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
     """Finds policies, teaches them, and writes the SE that teaches best.
 
     Args:
-      own: how policies are found, and how many students there are.
+      job: how policies are found, and how many students there are.
       config: task, students and their trainings, and seed.
       folder: where files are written; what was finished there is not done again.
       words: the command's overrides, for the card.
@@ -160,61 +155,57 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       ConfigError: for a folder of another command, or a policy that cannot be.
       OSError: if a file cannot be written.
     """
-    with Store(folder, settings_of(own, config)) as store:
+    with Store(folder, settings_of(job, config)) as store:
         store.get(CHECKPOINT)  # which refuses a folder of another command
-        return _distilled(own, config, store, words)
+        return _distilled(job, config, store, words)
 
 
-def _distilled(own: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
+def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
     task, folder = config.task(), store.folder
     uses = ("search", "nothing", "record", CHOOSE, TEST)  # policies are tested by the last one too
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
-    if own.policy is None:
-        lessons, costs = searched(own.search, task, own.num_snapshots, keys, store, config.devices)
+    if job.policy is None:
+        lessons, costs = searched(job.search, task, job.num_snapshots, keys, store, config.devices)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
-        lessons, costs = copied(own.copy, task, own.policy, keys)
+        lessons, costs = copied(job.copy, task, job.policy, keys)
     store.put(CHECKPOINT)
-    ses = [make_exact(task, x.layers, x.states, own.independent_starts) for x in lessons]
+    ses = [make_exact(task, x.layers, x.states, job.independent_starts) for x in lessons]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
-        student_keys = jax.random.split(keys[CHOOSE], own.num_students)
+        student_keys = jax.random.split(keys[CHOOSE], job.num_students)
         rows = students(ses, lessons, config, student_keys, store)
         rows["use"], marks = CHOOSE, grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
     se, lesson = ses[best], lessons[best]
-    student_keys = jax.random.split(keys[TEST], own.num_tested)
+    student_keys = jax.random.split(keys[TEST], job.num_tested)
     tested = students([se], [lesson], config, student_keys, store)
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
     learning = {
         "command": f"python -m sejax.distill {words}".rstrip(),
-        "generations": own.search.generations if own.policy is None else 0,
+        "generations": job.search.generations if job.policy is None else 0,
         "real_steps": int(spent["real_steps"]),
         "agents": len(rows),
         "train_steps": int(rows["train_steps"].sum()),
         "cpu_s": round(float(spent["cpu_s"]), 1),
     }
-    record: dict[str, Any] = {
-        "generation": lesson.generation,
-        "seed": config.seed,
-        "learning": learning,
-    }
-    record |= {"policy_return": lesson.policy_return, "evaluations": evaluations_of(tested)}
+    record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
+    record |= {"learning": learning, "policy_return": lesson.policy_return}
     path, plain = folder / "proxy.safetensors", configuration.plain(config)
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
-    save(path, *se, learned_with, **record)
+    save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
 
 
-def settings_of(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
     """What the numbers depend on, as plain values."""
     plain = configuration.plain(config)
-    return to_plain(own) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
+    return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:

@@ -27,6 +27,13 @@ from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
 from sejax.runs.worlds import Setup, proxy_setup, real_setup
 
+# Columns of the table: what they show, and with how many digits.
+SHOWN = {
+    "return": ("test_return", 1),
+    "training steps": ("train_steps", 0),
+    "training episodes": ("train_episodes", 1),
+}
+
 
 def main(overrides: Sequence[str]) -> None:
     """Evaluates each configuration that the overrides describe.
@@ -135,15 +142,11 @@ def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) ->
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]
-    for column in (*labels, "return", "training steps", "training episodes"):
+    for column in (*labels, *SHOWN):
         table.add_column(column, justify="left" if column in labels else "right")
     for index, row in summary.iterrows():
-        table.add_row(
-            *([index] if len(labels) == 1 else index),
-            spread(row.test_return_mean, row.test_return_std, 1),
-            spread(row.train_steps_mean, row.train_steps_std, 0),
-            spread(row.train_episodes_mean, row.train_episodes_std, 1),
-        )
+        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in SHOWN.values())
+        table.add_row(*([index] if len(labels) == 1 else index), *numbers)
     console = Console(highlight=False)
     console.print(table)
     diverged = int(summary["num_nonfinite"].sum())

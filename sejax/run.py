@@ -86,14 +86,14 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         runtime.configure_jax()
                         chunks = machines.enter_context(config.machines.make(config))
                         compiled = program
-                    ended = session.run(config, directory, chunks, progress)
+                    summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     progress.stop()
                     saved = f"{directory.finished_generations} generations are saved"
                     message = f"Interrupted. {saved} in {directory.path}; the same command goes on"
                     commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
-                if ended == "diverged":
+                if summary["ended"] == "diverged":
                     diverged.append(directory.path)
                 elif len(configs) == 1:
                     progress.finish(directory, chunks.learner, scores[-1])

@@ -12,7 +12,7 @@ python -m sejax.run.
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from sejax.options import ConfigError, as_text, help_texts, require, told
+from sejax.options import ConfigError, field_lines, require, told
 from sejax.options.plain import to_plain
 from sejax.runs import commands, runtime
 
@@ -48,9 +48,8 @@ def help_text(overrides: Sequence[str]) -> str:
     require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
     from sejax.searching.config import SearchConfig
 
-    texts, defaults = help_texts(SearchConfig), to_plain(SearchConfig())
-    fields = [f"  {name}={as_text(x)}  # {texts[name]}" for name, x in defaults.items()]
-    return "\n".join([str(__doc__), "Fields, with their defaults:", *fields])
+    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)], {})
+    return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ MODES: dict[str, tuple[tuple[object, ...], str]] = {
     "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
     "jax_debug_nans": ((False,), "what has not happened is nan, and a training may diverge"),
     "jax_debug_infs": ((False,), "the score before the first is minus infinity"),
+    "jax_disable_jit": ((False,), "trainings are compiled as a whole"),
     "jax_debug_key_reuse": ((False,), "the state of a run that has ended keeps its key"),
     "jax_numpy_rank_promotion": (("allow", "warn"), "operands are broadcast"),
     "jax_numpy_dtype_promotion": (("standard",), "numbers of several types are combined"),
@@ -292,13 +293,7 @@ class _Loop:
             )
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
 
-    def train(
-        self,
-        key: Array,
-        env_params: PyTree,
-        hparams: Hparams,
-        active: Array,
-    ) -> TrainResult:
+    def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
         """One training."""
         env_params = self.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)

@@ -203,6 +203,8 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("proxy=rn stop_when_solved=true", "stop_when_solved", "=false"),
     ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps",
      ""), ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
+    ("seeds=4", "seeds", "num_seeds?"),
+    ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", "any more"),
 ])  # fmt: skip
 def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     override, field, suggested

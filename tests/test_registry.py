@@ -128,7 +128,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
 # --- module:attribute ----------------------------------------------------------------------------
 
 SEVERAL = """
-import dataclasses, functools
+import dataclasses
 import sejax
 from sejax.es.nes import NESConfig, make_nes
 
@@ -145,8 +145,6 @@ class Outer:
 
 def scaled(task, scale: float, offset: float = 0.0, steps: tuple[int, ...] = (1, 2), also=[3]):
     return sejax.Objective(score=lambda outcome: scale * outcome.test_return + offset)
-
-doubled = functools.partial(scaled, scale=2.0)
 
 def unknown(task, scale=2.0) -> "Unknown | Objective":
     return scaled(task, scale)
@@ -177,7 +175,7 @@ def task(sizes: list[int] = [1, 2], length: float = None) -> 'sejax.Task':
 @pytest.mark.parametrize(("attribute", "values"), [
     ("Scaled", {"scale": 3.0, "needed": 1}), ("Outer.Inner", {"scale": 2.0, "needed": 1}),
     ("scaled", {"scale": 3.0, "offset": 0.0, "steps": (4,), "also": [3]}),
-    ("doubled", {"scale": 2.0}), ("unknown", {"scale": 2.0}),  # a partial; no known return type
+    ("unknown", {"scale": 2.0}),  # no known return type
 ])  # fmt: skip
 def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     module, attribute, values

@@ -130,7 +130,6 @@ def test_a_finished_run_is_left_as_it_is(run):
 def test_a_state_comes_back_bit_for_bit(tmp_path):
     state = {
         "key": jax.random.split(jax.random.key(3), 2),
-        "bfloat16": jnp.array([[1.5, -0.0]], jnp.bfloat16),
         "special": jnp.array([jnp.nan, jnp.inf, -0.0, 1e-45]),
         "empty": jnp.zeros((0, 3)),
         "flag": jnp.array(True),

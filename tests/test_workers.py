@@ -23,8 +23,9 @@ def require_equal_numbers(words, generations):
         sizes.extend(len(trainings.active) for _, trainings in shares)
         return [workers.score(setup, share) for share in reversed(shares)][::-1]
 
-    remote = RemoteChunks(config, lambda: 2, compute)
+    remote = RemoteChunks(config, compute)
     local = Chunks(remote.learner)
+    local.compile(1)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))
     for _ in range(generations):
         state, info = local.advance(state, 1)

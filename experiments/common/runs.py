@@ -91,7 +91,7 @@ def learn(
     chunks = chunks or workers.make_chunks(configs[0])
     curves = []
     for config in configs:
-        with run_directory.RunDirectory(config, f"Set {option}=DIR.") as directory:
+        with run_directory.RunDirectory(config, option) as directory:
             path = directory.path / "cpu_s.txt"
             session.run(config, directory, timed(chunks, path))
             curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)

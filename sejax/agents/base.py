@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
+from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import jax
 from jaxtyping import Array, Int, PyTree
@@ -207,7 +207,6 @@ class AgentOptions(AgentConfig):
 
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
-    removed: ClassVar[dict[str, Any]] = {"torso": None, "num_filters": 16}
 
     warmup_episodes: int = option(1, counts("it counts episodes", least=0))
 

@@ -7,7 +7,6 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    ADAM,
-    OffPolicy,
-    OffPolicyOptions,
-    adam_step,
-    soft_update,
-)
+from sejax.agents.off_policy import ADAM, OffPolicy, OffPolicyOptions, adam_step, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
@@ -43,12 +36,6 @@ class DDQNConfig(OffPolicyOptions):
         learns, whatever the episodes: for environments whose episodes have one or two steps.
       double: the online network chooses a target's action; else the target network
     """
-
-    removed: ClassVar[dict[str, Any]] = {
-        **OffPolicyOptions.removed,
-        **dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1),
-        "loss": "squared",
-    }
 
     epsilon_init: float = option(1.0, fraction(), traced=True)
     epsilon_min: float = option(0.01, fraction(), traced=True)

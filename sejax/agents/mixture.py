@@ -7,7 +7,7 @@ outer loop helps all of them, at the same number of trainings.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,6 @@ class MixtureConfig(Options):
     """
 
     group: ClassVar[str] = "agents"
-    removed: ClassVar[dict[str, Any]] = {"compared_by": "advantage"}
 
     aggregate: str = option("mean", one_of(("mean", "min")))
 

@@ -15,13 +15,7 @@ import optax
 from jaxtyping import Array, PyTree
 
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
-from sejax.agents.buffers import (
-    BufferMaker,
-    Transition,
-    num_columns,
-    replay_buffer,
-    sum_over_batch,
-)
+from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops.networks import MLP
 from sejax.options import (
     ACTIVATIONS,
@@ -76,11 +70,7 @@ class OffPolicyOptions(AgentOptions):
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
         return MLP(
-            num_outputs,
-            self.hidden_size,
-            self.num_layers,
-            self.activation,
-            learn_prelu_slope=True,
+            num_outputs, self.hidden_size, self.num_layers, self.activation, learn_prelu_slope=True
         )
 
 

@@ -21,13 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    ADAM,
-    ActorCritic,
-    ActorCriticOptions,
-    adam_step,
-    soft_update,
-)
+from sejax.agents.off_policy import ADAM, ActorCritic, ActorCriticOptions, adam_step, soft_update
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops.networks import init_narrowed

@@ -98,7 +98,9 @@ _BY_ADVANTAGE = (single_best, single_better, all_better_1, all_better_2)
 TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY_ADVANTAGE)}
 
 
-def require_transform(field: str, choice: object, default: object = None) -> None:
+def require_transform(
+    field: str, choice: str | OwnTransform, default: str | OwnTransform | None = None
+) -> None:
     """Checks that it is a name, a `module:attribute` that may be imported, or a function.
 
     Raises:
@@ -107,7 +109,7 @@ def require_transform(field: str, choice: object, default: object = None) -> Non
     if isinstance(choice, str) and ":" in choice:
         registry.require_path(field, choice)
     elif not callable(choice) and choice not in [*TRANSFORMS]:
-        raise unknown_name(field, choice, TRANSFORMS)
+        raise unknown_name(field, str(choice), TRANSFORMS)
 
 
 def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:

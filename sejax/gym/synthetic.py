@@ -240,7 +240,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
         one_of(["NextStep", "SameStep"])("autoreset_mode", mode, None)
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode(mode)}
         self.single_observation_space = world.observation_space

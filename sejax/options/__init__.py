@@ -37,7 +37,7 @@ from collections import ChainMap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard, TypeVar
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
 MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
@@ -47,7 +47,8 @@ MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 MOST, LEAST = 1e30, 1e-30  # of numbers that programs compute with in 32 bits
 
-Rule = Callable[[str, Any, Any], None]  # (name, value, default) -> None, or raises ConfigError
+T = TypeVar("T")
+Rule = Callable[[str, T, T | None], None]  # (name, value, default) -> None, or raises ConfigError
 
 
 # --- errors --------------------------------------------------------------------------------------
@@ -93,16 +94,16 @@ def require(holds: object, field: str, message: str) -> None:
         raise ConfigError(f"{field} {message}", field)
 
 
-def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
+def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
     message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
     return ConfigError(f"{message} Did you mean {field}={ranked[0]}?", field)
 
 
-def nearest(got: object, known: Iterable[str]) -> list[str]:
+def nearest(got: str, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
-    text = str(got)[:200].lower()  # comparing takes time that grows with the square of the length
+    text = got[:200].lower()  # comparing takes time that grows with the square of the length
     return sorted(known, key=lambda name: -SequenceMatcher(None, text, name.lower()).ratio())
 
 
@@ -154,7 +155,7 @@ _LIBRARIES = (
 
 def option(
     default: Any = dataclasses.MISSING,
-    rule: Rule | None = None,
+    rule: Rule[T] | None = None,
     *,
     traced: bool = False,
     varied: str | None = None,
@@ -178,12 +179,10 @@ def option(
 class Options:
     """A dataclass whose fields check themselves.
 
-    `group` is where the command line has them. `removed` are fields of earlier versions, with the
-    only value that a file may still give them: what is computed without them.
+    `group` is where the command line has them.
     """
 
     group: ClassVar[str] = ""
-    removed: ClassVar[dict[str, Any]] = {}
 
     def __post_init__(self) -> None:
         """Checks all fields that have a rule.
@@ -221,19 +220,21 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
 
 def field_lines(
-    values: Mapping[str, Any], texts: Mapping[str, str], sources: Mapping[str, str] | None = None
+    values: Mapping[str, Any], classes: Iterable[tuple[str, type]], sources: Mapping[str, str]
 ) -> str:
     """Lines of `--help`: each field with its value, its text, and where its value comes from.
 
     Args:
       values: plain values by the fields' names.
-      texts: from `help_texts`, by the same names.
+      classes: groups of fields, each with a class whose docstring has their texts.
       sources: what stands behind a field's text, such as the layer that its value is from.
     """
+    of_groups = ((group, help_texts(cls).items()) for group, cls in classes)
+    texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
     lines = []
     for name, value in values.items():
         about = f"  # {texts[name]}" if name in texts else ""
-        line = f"  {name}={as_text(value)}{about}{(sources or {}).get(name, '')}"
+        line = f"  {name}={as_text(value)}{about}{sources.get(name, '')}"
         lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
     return "\n".join(lines)
 
@@ -249,7 +250,7 @@ def help_texts(cls: type) -> dict[str, str]:
     return texts
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether it is an int or a float, which a bool is not here; see `as_python`."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
@@ -267,10 +268,10 @@ def as_python(value: Any) -> Any:
 # --- rules ---------------------------------------------------------------------------------------
 
 
-def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
+def rule(holds: Callable[[T], bool], must: str, reason: str) -> Rule[T]:
     """The rule that a predicate holds; see `require`."""
 
-    def apply(name: str, value: Any, default: Any) -> None:
+    def apply(name: str, value: T, default: T | None) -> None:
         if not holds(value):
             got, fix = shortened(value), f"{name}={as_text(default)}"
             raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
@@ -293,63 +294,63 @@ def as_text(value: object) -> str:
     return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
 
 
-def between(low: float, high: float, reason: str, must: str = "") -> Rule:
+def between(low: float, high: float, reason: str, must: str = "") -> Rule[float]:
     """A number from `low` to `high`."""
     must = must or f"lie between {low:g} and {high:g}"
     return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
 
 
-def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule:
+def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule[float]:
     """A whole number from `least` to `most`."""
     must = f"be a whole number from {least} to {most}"
     return rule(lambda x: is_number(x) and least <= x <= most and x == x // 1, must, reason)
 
 
-def not_negative(reason: str = "it is a size") -> Rule:
+def not_negative(reason: str = "it is a size") -> Rule[float]:
     """A finite number from 0 on."""
     return between(0, MOST, reason)
 
 
-def finite(reason: str) -> Rule:
+def finite(reason: str) -> Rule[float]:
     """A finite number, of either sign."""
     return between(-MOST, MOST, reason)
 
 
-def positive(reason: str, at_most: float = MOST) -> Rule:
+def positive(reason: str, at_most: float = MOST) -> Rule[float]:
     """A finite number above 0 with which programs can compute in 32 bits."""
     return between(LEAST, at_most, reason)
 
 
-def fraction() -> Rule:
+def fraction() -> Rule[float]:
     """A number in [0, 1]."""
     return between(0, 1, "it is a fraction")
 
 
-def shrinks() -> Rule:
+def shrinks() -> Rule[float]:
     """A factor in (0, 1]."""
     return between(LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
 
 
-def seed() -> Rule:
+def seed() -> Rule[float]:
     """A seed that `jax.random.key` takes as it is."""
     return between(0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
 
 
-def one_of(known: Collection[str]) -> Rule:
+def one_of(known: Collection[str]) -> Rule[str]:
     """One of these names."""
 
-    def apply(name: str, value: Any, default: Any) -> None:
+    def apply(name: str, value: str, default: str | None) -> None:
         if value not in known:
-            raise unknown_name(name, value, known)
+            raise unknown_name(name, str(value), known)
 
     return apply
 
 
-def each_of(known: Collection[str]) -> Rule:
+def each_of(known: Collection[str]) -> Rule[Iterable[str]]:
     """A list of these names."""
 
-    def apply(name: str, values: Iterable[Any], default: Any) -> None:
+    def apply(name: str, values: Iterable[str], default: Iterable[str] | None) -> None:
         for value in values:
-            one_of(known)(name, value, default)
+            one_of(known)(name, value, None)
 
     return apply

@@ -1,5 +1,6 @@
 """Parts of a program, each given as it is or as a configuration that makes it."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from sejax.options import registry, require, shortened
@@ -12,7 +13,8 @@ T_co = TypeVar("T_co", covariant=True)
 class Makes(Protocol[T_co]):
     """A configuration that makes a part, of a task or of whatever such a part is for."""
 
-    def make(self, argument: Any, /) -> T_co: ...
+    @property
+    def make(self) -> Callable[..., T_co]: ...
 
 
 @runtime_checkable
@@ -25,20 +27,20 @@ class RunConfig(Protocol):
     def parts(self) -> dict[str, Any]: ...
 
 
-def make_part(group: str, cls: type[T], part: T | Makes[T], argument: object) -> T:
+def make_part(group: str, cls: type[T], part: T | Makes[T], *arguments: Any) -> T:
     """The part itself.
 
     Args:
       group: the field that it is given as.
       cls: its class.
       part: the part, or its configuration.
-      argument: of `Makes.make`.
+      *arguments: of `Makes.make`.
 
     Raises:
       ConfigError: for anything else.
     """
     if not isinstance(part, cls) and isinstance(part, Makes):
-        part = registry.make(group, part, argument)
+        part = registry.make(group, part, *arguments)
     return require_part(group, cls, part)
 
 

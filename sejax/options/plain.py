@@ -20,18 +20,23 @@ from sejax.options import (
     ConfigError,
     as_text,
     errors_of,
-    is_number,
     listed,
     marks,
     nearest,
     require,
     shortened,
-    told,
 )
 
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
+# Fields of earlier versions, with the only value that a file may still give them: what is computed
+# without them.
+GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
+GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
+GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
+# Fields by the names that others give them.
+SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
 
@@ -69,14 +74,12 @@ def from_plain(
     try:
         hints = typing.get_type_hints(cls)
     except NameError as error:
-        raise ConfigError(
-            f"{where} must have fields of known types: {told(error)}.", where
-        ) from error
+        message = f"{where} must have fields of known types: {error}."
+        raise ConfigError(message, where) from error
     defaults, fields = fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
-    removed = getattr(cls, "removed", {})
     for name, value in values.items():
-        if name in removed and removed[name] == value:
+        if name not in defaults and GONE.get(name, MISSING) == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
@@ -113,9 +116,11 @@ def fields_of(cls: type) -> dict[str, Any]:
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """Error for a field that is not there, with the nearest of those that are."""
     field, last = shortened(field, 40), field.rpartition(".")[2]
-    ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
+    meant = SYMBOLS.get(last, last)
+    ranked = [name for name in known if name.rpartition(".")[2] == meant] or nearest(field, known)
     fix = f" Did you mean {ranked[0]}?" if ranked else ""
-    return ConfigError(f"{field} is no field.{fix} Fields: {listed(ranked)}.", field)
+    is_no = "is no field any more" if last in GONE else "is no field"
+    return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
 
 
 def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
@@ -131,7 +136,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
     candidates = [value]
     if isinstance(value, str):
         candidates = [parsed(expanded(value)), expanded(value)]
-    elif is_number(value):  # or a name of digits, as of a folder
+    elif type(value) in (int, float):  # or a name of digits, as of a folder
         candidates = [value, str(value)]
     must = "be no true or false"
     for candidate in candidates:
@@ -149,9 +154,8 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
     raise ConfigError(f"{name} must {must}; got {shortened(repr(value))}. Set {name}={fix}.", name)
 
 
-@functools.cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+_CONVERSION = ConfigDict(arbitrary_types_allowed=True)
+_adapter = functools.cache(functools.partial(TypeAdapter, config=_CONVERSION))
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

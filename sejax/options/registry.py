@@ -35,18 +35,15 @@ import inspect
 import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from sejax.options import (
-    ConfigError,
-    Options,
-    place_of,
-    require,
-    shortened,
-    told,
-    unknown_name,
-)
+from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
+
+if TYPE_CHECKING:
+    from sejax.options.parts import Makes
+
+T = TypeVar("T")
 
 
 class Group(NamedTuple):
@@ -67,17 +64,15 @@ class Group(NamedTuple):
 
 GROUPS = {
     "env": Group("sejax.envs", "sejax.envs.base:Task", ()),
-    "agent": Group(
-        "sejax.agents", "sejax.agents.base:Agent", ("task",), "sejax.agents.base:AgentConfig"
-    ),
+    "agent": Group("sejax.agents", "sejax.agents:Agent", ("task",), "sejax.agents:AgentConfig"),
     "exploration": Group(
         "sejax.explorations",
-        "sejax.agents.base:Agent",
+        "sejax.agents:Agent",
         ("agent", "task"),
-        "sejax.agents.base:ExplorationConfig",
+        "sejax.agents:ExplorationConfig",
     ),
     "proxy": Group(
-        "sejax.proxies", "sejax.proxies.base:ProxyEnv", ("task",), "sejax.proxies:ProxyConfig"
+        "sejax.proxies", "sejax.proxies:ProxyEnv", ("task",), "sejax.proxies:ProxyConfig"
     ),
     "objective": Group("sejax.objectives", "sejax.objectives:Objective", ("task",)),
     "es": Group("sejax.strategies", "sejax.es.base:Strategy", ("num_dims",)),
@@ -139,10 +134,7 @@ BUILT_IN = {
         "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
         "wandb": "sejax.runs.trackers:WandbConfig",
     },
-    "machines": {
-        "local": "sejax.runs.workers:LocalConfig",
-        "ray": "sejax.runs.workers:RayConfig",
-    },
+    "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
 }
 # Beginnings of a task's name: a dataclass with a field `name`.
 PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"}
@@ -161,7 +153,7 @@ def is_registered(group: str, name: str) -> bool:
     return _path_of(group, name) is not None
 
 
-def find(group: str, name: object, imports: Collection[str] | None = None) -> Any:
+def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
     """The dataclass that a name stands for.
 
     Args:
@@ -173,22 +165,21 @@ def find(group: str, name: object, imports: Collection[str] | None = None) -> An
       ConfigError: for an unknown name, a module that cannot or may not be imported, or an
         attribute that is no plugin.
     """
-    text = name if isinstance(name, str) else ""
-    if text in BUILT_IN[group]:
-        return _attribute(BUILT_IN[group][text])
-    path = _path_of(group, text)
-    if path is None and ":" in text:
-        path = text
+    if name in BUILT_IN[group]:
+        return _attribute(BUILT_IN[group][name])
+    path = _path_of(group, name)
+    if path is None and ":" in name:
+        path = name
         require_typed(group, path, imports)
     if path is None:
-        raise unknown_name(group, name, [*names(group), *_meant(text)])
-    cls = _as_dataclass(group, text, imported(group, path))
-    if f"{cls.__module__}:{cls.__qualname__}" != text:
-        _NAMES[cls] = text
+        raise unknown_name(group, name, [*names(group), *_meant(name)])
+    cls = _as_dataclass(group, name, imported(group, path))
+    if f"{cls.__module__}:{cls.__qualname__}" != name:
+        _NAMES[cls] = name
     return cls
 
 
-def name_of(group: str, config: object) -> str:
+def name_of(group: str, config: "Makes[Any]") -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
     if _is_one_of_many(cls):
@@ -249,7 +240,7 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
       0.9
     """
-    is_choice = isinstance(values, Mapping) and "name" in values
+    is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
     message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
     require(is_choice, group, message)
     cls = find(group, values["name"], imports)
@@ -262,12 +253,12 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     return from_plain(cls, fields, group, imports)
 
 
-def describe(group: str, config: object) -> dict[str, Any]:
+def describe(group: str, config: "Makes[Any]") -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
 
 
-def make(group: str, config: Any, *arguments: Any) -> Any:
+def make(group: str, config: "Makes[T]", *arguments: Any) -> T:
     """What a configuration configures, built once for equal configurations and arguments.
 
     Compiled programs are cached by the identity of what they were built from, so that a new
@@ -277,13 +268,15 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
     key = (group, config if is_hashable(config) else id(config), *arguments)
-    if key not in _PARTS:
+    if key in _PARTS:
+        part: T = _PARTS[key][1]
+    else:
         part, cls = config.make(*arguments), _attribute(GROUPS[group].makes)
         name = shortened(name_of(group, config))
         message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
         require(isinstance(part, cls), group, message)
         _PARTS[key] = config, part  # with config, its id stays its own
-    return _PARTS[key][1]
+    return part
 
 
 _PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
@@ -298,7 +291,7 @@ def is_hashable(config: object) -> bool:
     return True
 
 
-def require_package(group: str, config: Any) -> None:
+def require_package(group: str, config: "Makes[Any]") -> None:
     """Checks that the package which a plugin names as its `package` is there; imports nothing.
 
     Raises:
@@ -354,19 +347,16 @@ def imported(field: str, path: str) -> Any:
         raise ConfigError(message, field) from error
 
 
-def _makes(plugin: object) -> bool:
-    """Whether it is a dataclass with `make`."""
-    return isinstance(plugin, type) and hasattr(plugin, "make") and dataclasses.is_dataclass(plugin)
-
-
 def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
     base, arguments = _attribute(GROUPS[group].base), GROUPS[group].arguments
-    if inspect.isfunction(plugin) or isinstance(plugin, functools.partial):
+    if inspect.isfunction(plugin):
         return _from_function(group, name, plugin)
+    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
+    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
     must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
     must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
-    require(_makes(plugin) and issubclass(plugin, base), group, f"{must} {shortened(plugin)}.")
+    require(is_fit, group, f"{must} {shortened(plugin)}.")
     return plugin
 
 
@@ -386,17 +376,13 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
 
     fields = []
     for p in options:
-        hint = Any if p.annotation is p.empty else p.annotation
-        default = {"default": p.default}
+        field: Any = dataclasses.field() if p.default is p.empty else p.default
         if not is_hashable(p.default):  # such as a list
-            default = {"default_factory": functools.partial(copy.copy, p.default)}
-        fields.append(
-            (p.name, hint, dataclasses.field(**({} if p.default is p.empty else default)))
-        )
-    written: Any = getattr(function, "func", function)  # of a partial, what it is one of
+            field = dataclasses.field(default_factory=functools.partial(copy.copy, p.default))
+        fields.append((p.name, Any if p.annotation is p.empty else p.annotation, field))
     base = _attribute(GROUPS[group].base)
     bases = (base if issubclass(base, Options) else Options,)
-    namespace = {"make": make, "__doc__": written.__doc__, "__module__": written.__module__}
-    frozen = {"frozen": True, "kw_only": True}
-    name = written.__name__
-    return dataclasses.make_dataclass(name, fields, bases=bases, namespace=namespace, **frozen)
+    namespace = {"make": make, "__doc__": function.__doc__, "__module__": function.__module__}
+    return dataclasses.make_dataclass(
+        function.__name__, fields, bases=bases, namespace=namespace, frozen=True, kw_only=True
+    )

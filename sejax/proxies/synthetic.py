@@ -6,7 +6,7 @@ and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Le
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -70,8 +70,6 @@ class SyntheticConfig(ProxyConfig):
         distance: the best of continuous actions, in units of their bound. The reward is minus the
         sum of the distances from it, so that the best policy is known.
     """
-
-    removed: ClassVar[dict[str, Any]] = {"reward_slope": 1.0, "horizon_is_terminal": True}
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))

@@ -10,6 +10,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 import yaml
@@ -49,7 +50,7 @@ def start(
             main(overrides)
 
 
-def _stop(number: int, frame: object) -> NoReturn:
+def _stop(number: int, frame: FrameType | None) -> NoReturn:
     """Hears SIGTERM as Ctrl-C is heard, with the exit code that shells give it."""
     # Where a callback of a library forgets the exception, it is raised again.
     again = threading.Timer(2.0, os.kill, (os.getpid(), number))
@@ -73,9 +74,8 @@ def _devices(overrides: Sequence[str]) -> int | None:
     """The number of devices that is asked for; 1 where trainings are computed elsewhere."""
     with contextlib.suppress(ConfigError):  # which is raised later
         values = compose.read(compose.expand(overrides)[0])
-        if values.get("machines", "local") != "local":
-            return 1
-        count = str(values.get("devices", ""))
+        is_here = values.get("machines", "local") == "local"
+        count = str(values.get("devices", "")) if is_here else "1"
         return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None
     return None
 

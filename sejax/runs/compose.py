@@ -14,16 +14,13 @@ import itertools
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from sejax import agents, envs
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, as_text, registry, require, shortened
+from sejax.options import ConfigError, Options, as_text, registry, require, shortened
 from sejax.options.plain import expanded, merge, parsed, split, unquoted
 from sejax.runs import preset_files
-
-if TYPE_CHECKING:
-    from sejax.runs.config import CommandConfig
 
 # Choices where neither a word nor the task or the proxy makes one.
 DEFAULTS = {
@@ -37,7 +34,7 @@ DEFAULTS = {
 }
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 Layers = dict[str, Mapping[str, Any]]
-Config = TypeVar("Config", bound="CommandConfig")
+Config = TypeVar("Config", bound=Options)
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -54,9 +51,8 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
       {'env': 'acrobot', 'agents': '[ddqn,ppo]'}
     """
     is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
-    got = shortened(repr(overrides))
-    message = f'must be a list of text; got {got}. Set overrides=["env=cartpole"].'
-    require(is_list, "overrides", message)
+    message = f"must be a list of text; got {shortened(overrides)}."
+    require(is_list, "overrides", f'{message} Set overrides=["env=cartpole"].')
     texts = {}
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
@@ -76,14 +72,13 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
 
 def meant(overrides: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
-    name, *values = [*filter(None, (word.strip("-=") for word in overrides[:3])), *["VALUE"] * 2]
-    if "=" in name:  # after dashes
-        return shortened(name)
-    value = "VALUE" if "=" in values[0] else values[0]
-    is_field = overrides[0].startswith("-") or name in registry.GROUPS or value != "VALUE"
-    if is_field and NAME.fullmatch(name) and not registry.is_registered("env", name):
-        return f"{shortened(name)}={shortened(value)}"
-    return f"env={shortened(name)} or proxy={shortened(name)}, if that is meant"
+    pattern = r"([-=\s]*)([^\s=]*)(?:[\s=]+([^\s=]+)(?!\S))?"
+    dashes, name, value = re.findall(pattern, " ".join(overrides[:3]))[0]
+    is_field = NAME.fullmatch(name) and not registry.is_registered("env", name)
+    if is_field and (dashes or value or name in registry.GROUPS):
+        return f"{shortened(name)}={shortened(value or 'VALUE')}"
+    name = shortened(name or "NAME")
+    return f"env={name} or proxy={name}, if that is meant"
 
 
 def read(overrides: Sequence[str]) -> dict[str, Any]:
@@ -173,9 +168,8 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in given]:
-        names = parsed(given[field]) if isinstance(given[field], str) else given[field]
-        names = names if isinstance(names, list) else [names]
-        names = [x if isinstance(x, str) else as_text(x) for x in names]
+        names = parsed(str(given[field]))
+        names = [*map(as_text, names if isinstance(names, list) else [names])]
         several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
         is_clear = names and not chosen and len({*names}) == len(names)
         message = f"must name each agent once; got {shortened(given[field])}. Set agents="
@@ -199,15 +193,14 @@ def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
 
 
 def compose(
-    schema: "type[CommandConfig]",
-    overrides: Sequence[str],
-    stored: Mapping[str, Any] | None = None,
+    overrides: Sequence[str], groups: Collection[str], learns: bool, stored: Mapping[str, Any]
 ) -> tuple[Layers, frozenset[str]]:
     """Composes a command's words over its preset and its choices.
 
     Args:
-      schema: the command's configuration.
       overrides: as typed after the command.
+      groups: of plugins whose choices are the command's fields.
+      learns: whether presets have settings.
       stored: what a stored proxy was learned with, nested plain values.
 
     Returns:
@@ -217,16 +210,16 @@ def compose(
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given, stored = read(overrides), stored or {}
+    given = read(overrides)
     imports = frozenset(registry.paths_in(overrides))
-    usual = DEFAULTS | {group: stored[group]["name"] for group in schema.groups if group in stored}
-    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in schema.groups}
+    usual = DEFAULTS | {group: stored[group]["name"] for group in groups if group in stored}
+    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in groups}
     names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = _default_agent(given, imports)
         names = {default: default}
     preset, of_preset = str(given.get("preset", "best")), {}
-    if schema.learns:
+    if learns:
         section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
         objective = registry.find("proxy", chosen["proxy"], imports).default_objective
         objective = section.get("objective", {}).get("name", objective)
@@ -237,7 +230,7 @@ def compose(
         "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
         f"preset={preset}": of_preset,
         "proxy": stored,
-        "typed": _nested(given, names, schema.groups),
+        "typed": _nested(given, names, groups),
     }
     return layers, imports
 
@@ -248,15 +241,15 @@ def _nested(
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
     for name, value in given.items():
+        group, _, field = name.partition(".")
         if name in (*groups, "agent", "agents"):
             continue
-        first, *path = name.split(".")
-        if first == "agent":
-            key, got = next(iter(agents)), shortened(value)
-            message = f"must be one agent's; got {got}. Set agents.{key}{name[5:]}={got}."
-            require(len(agents) == 1, name, message)
-            first, *path = "agents", key, *path
-        for part in reversed(path):
+        if group == "agent":
+            full, got = f"agents.{next(iter(agents))}.{field}", shortened(value)
+            is_clear = len(agents) == 1
+            require(is_clear, name, f"must be one agent's; got {got}. Set {full}={got}.")
+            name = full
+        for part in reversed(name.split(".")):
             value = {part: value}
-        tree = merge(tree, {first: value})
+        tree = merge(tree, value)
     return tree

@@ -24,7 +24,6 @@ from sejax.options import (
     counts,
     errors_of,
     field_lines,
-    help_texts,
     one_of,
     option,
     registry,
@@ -32,17 +31,10 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import (
-    fields_of,
-    flatten,
-    from_plain,
-    merge,
-    to_plain,
-    unknown_field,
-)
+from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
 from sejax.runs import preset_files
-from sejax.runs.compose import DEFAULTS, agents_of, compose, field_of, key_of, read
+from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, read
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -102,6 +94,50 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
+    def require_fit(self, key: str, spec: TaskSpec, task_name: str) -> None:
+        """Checks that one of the agents can act in a task.
+
+        Raises:
+          ConfigError: if it cannot.
+        """
+        with errors_of("agent", field_of(key, self.agents)):
+            agents.require_fit(self.agents[key], self.exploration, spec, task_name)
+
+    def require_learning(
+        self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
+    ) -> None:
+        """Checks that an agent learns something on a proxy.
+
+        Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a
+        step budget must let it learn. What stops it must not read the proxy's returns.
+
+        Args:
+          key: of the agent.
+          group: of the fields of its training.
+          training: how long it trains.
+          proxy: the proxy's configuration.
+          spec: of the real task.
+
+        Raises:
+          ConfigError: if it does not.
+        """
+        longest, steps, got = (
+            proxy.max_steps(spec.max_steps),
+            training.max_steps,
+            training.solved_by,
+        )
+        require_reachable(group, training, longest)
+        field = f"{group}.solved_by"
+        message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
+        require(training.stop_rule != "solved" or got == "test", field, message)
+        before = self.agents[key].steps_before_learning(longest, spec.max_steps)
+        message = (
+            f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
+        )
+        is_enough = not proxy.reaches_step_limit or steps is None or steps > before
+        field = f"{group}.max_steps"
+        require(is_enough, field, f"{message} Set {field}={4 * before}.")
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
@@ -149,24 +185,19 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        seed()("seed + num_seeds - 1", self.seed + self.num_seeds - 1, 0)
         registry.require_package("tracker", self.tracker)
         registry.require_package("machines", self.machines)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
-        message = (
-            f"must be left out with other machines; got {self.devices}. Set machines.workers=N."
-        )
+        message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
         is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
         message = f"must be false with objective={self.name('objective')}, whose scores are no"
         require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
-        if not self.proxy.has_real_dynamics:
-            require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
         for key in self.agents:
-            require_fit(self, key, spec, task_name)
-            require_learning(self, key, "training", self.training, self.proxy, spec)
+            self.require_fit(key, spec, task_name)
+            self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
@@ -184,11 +215,8 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The objects that it describes, as `sejax.make_learner` takes them."""
-        task, is_varied = self.task(), self.agent_hparams == "varied"
-        learners = tuple(
-            agents.make_agent(agent, task, self.exploration, is_varied)
-            for agent in self.agents.values()
-        )
+        task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
+        learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
         names, weights = tuple(self.agents), self.weights
         several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
@@ -251,58 +279,8 @@ class EvaluateConfig(CommandConfig):
         default, training = to_plain(TRAINING), to_plain(self.training).items()
         changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
         fix = "" if self.proxy == "real" else "training_from=config, or "
-        message = (
-            f"must be left out, as it says nothing here; got {changed}. Set {fix}real_training.*."
-        )
+        message = f"must be left out, as it is idle here; got {changed}. Set {fix}real_training.*."
         require(self.training_from == "config" or not changed, "training", message)
-
-
-# --- what must hold of an agent -------------------------------------------------------------------
-
-
-def require_fit(config: CommandConfig, key: str, spec: TaskSpec, task_name: str) -> None:
-    """Checks that one of a configuration's agents can act in a task.
-
-    Raises:
-      ConfigError: if it cannot.
-    """
-    with errors_of("agent", field_of(key, config.agents)):
-        agents.require_fit(config.agents[key], config.exploration, spec, task_name)
-
-
-def require_learning(
-    config: CommandConfig,
-    key: str,
-    group: str,
-    training: TrainingConfig,
-    proxy: ProxyConfig,
-    spec: TaskSpec,
-) -> None:
-    """Checks that an agent learns something on a proxy.
-
-    Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a step
-    budget must let it learn. What stops it must not read the proxy's returns.
-
-    Args:
-      config: of the command.
-      key: of the agent.
-      group: of the fields of its training.
-      training: how long it trains.
-      proxy: the proxy's configuration.
-      spec: of the real task.
-
-    Raises:
-      ConfigError: if it does not.
-    """
-    field, got = f"{group}.solved_by", training.solved_by
-    message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
-    require(training.stop_rule != "solved" or got == "test", field, message)
-    field, steps = f"{group}.max_steps", training.max_steps
-    limits = proxy.max_steps(spec.max_steps), spec.max_steps
-    before = config.agents[key].steps_before_learning(*limits)
-    message = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
-    is_enough = not proxy.reaches_step_limit or steps is None or steps > before
-    require(is_enough, field, f"{message} Set {field}={4 * before}.")
 
 
 # --- plain values ---------------------------------------------------------------------------------
@@ -359,15 +337,14 @@ def _from_plain(
     is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
     message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
     require(is_map and several, "agents", message)
-    of_mixture = (*fields_of(MixtureConfig), *MixtureConfig.removed) if schema.learns else ()
-    shared = {name: several[name] for name in of_mixture if name in several}
+    shared = {name: x for name, x in several.items() if not isinstance(x, Mapping)}
+    shared = shared if schema.learns else {}
     keys, weights = sorted(several.keys() - shared.keys()), []
     objects["agents"] = {}
     for key in keys:
         where, agent = field_of(shortened(key, 40), keys), several[key]
         agent = dict(agent) if isinstance(agent, Mapping) else {}
-        is_shared = schema.learns and "weight" in agent
-        share = {"weight": agent.pop("weight")} if is_shared else {}
+        share = {k: agent.pop(k) for k in fields_of(Share) if schema.learns and k in agent}
         weights.append(from_plain(Share, share, where).weight)
         with errors_of("agent", where):
             objects["agents"][key] = registry.configure("agent", agent, imports)
@@ -401,16 +378,21 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    layers, imports = compose(LearnConfig, overrides)
-    return _from_plain(LearnConfig, merge(*layers.values()), imports)
+    return _composed(LearnConfig, overrides)[0]
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    layers, imports = compose(EvaluateConfig, overrides, _learned(read(overrides)))
     message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-    require("proxy" in layers["typed"], "proxy", message)
-    return _from_plain(EvaluateConfig, merge(*layers.values()), imports)
+    require("proxy" in read(overrides), "proxy", message)
+    return _composed(EvaluateConfig, overrides)[0]
+
+
+def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:
+    """A command's configuration of its words, and the layers that it comes from."""
+    stored = {} if schema.learns else _learned(read(overrides))
+    layers, imports = compose(overrides, schema.groups, schema.learns, stored)
+    return _from_plain(schema, merge(*layers.values()), imports), layers
 
 
 def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
@@ -420,32 +402,27 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
     layer beside it that it comes from.
     """
     words = overrides if schema.learns else ["proxy=RUN_DIR", *overrides]
-    layers, imports = compose(schema, words, {} if schema.learns else _learned(read(words)))
-    config = _from_plain(schema, merge(*layers.values()), imports)
+    config, layers = _composed(schema, words)
     lines = ["Choices (group=choice):"]
     for group in ("agent", *schema.groups):
-        prefixes = [f"{start}ID" for start in registry.PREFIXES] if group == "env" else []
+        prefixes = ["gymnax/ID"] if group == "env" else []
         known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if schema.learns:
         lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
-    classes = {name: type(x) for name, x in vars(config).items()}
-    classes |= {field_of(key, config.agents): type(x) for key, x in config.agents.items()}
-    classes |= {"": schema, "agents": MixtureConfig}
+    classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
+    classes += [(name, type(x)) for name, x in vars(config).items()]
+    for key, agent in config.agents.items():
+        classes += [(field_of(key, config.agents), cls) for cls in (Share, type(agent))]
     sources = dict[str, str]()
     for layer, values in layers.items():
         names = flatten(_as_words(values, config.agents))
         sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
-    fields, texts = words_of(config), dict[str, str]()
-    choices = {name.removesuffix(".name") for name in fields if name.endswith(".name")}
-    fields = {k: x for k, x in fields.items() if k.removesuffix(".name") not in choices}
-    for name in fields:
-        group, _, field = name.rpartition(".")
-        of_group = help_texts(Share) | help_texts(classes.get(group, Share))
-        texts |= {name: of_group[field]} if field in of_group else {}
-    return "\n".join([*lines, field_lines(fields, texts, sources)])
+    values = flatten(_as_words(plain(config), config.agents))
+    fields = {name: x for name, x in values.items() if not name.endswith(".name")}
+    return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
@@ -478,9 +455,7 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
     if source == "real":
         return {}
     field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
-    message = (
-        f"must be left out with agent_hparams=as_learned; got {got}. Set agent_hparams=default."
-    )
+    message = f"must be left out with agent_hparams=as_learned; got {got}. Set it to default."
     require(not words or hparams != "as_learned", field, message)
     stored, learned = None, dict[str, Any]()
     try:

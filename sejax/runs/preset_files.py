@@ -8,18 +8,20 @@ overrides.
 """
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from sejax.options import ConfigError, listed, shortened, told, unknown_name
-from sejax.options.plain import flatten, merge, parsed
+from sejax.options.plain import flatten, merge
 
 PRESETS = Path(__file__).parents[1] / "presets"
 GENERAL = "general"  # the presets of tasks without a file of their own
 ENDING = ".yaml"  # of a preset file
+# What reading a file of YAML may raise.
+UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
 NONE = ("agent", "agents")  # fields that an older run's config.yaml has as null
 
 
@@ -54,13 +56,6 @@ def is_tuned(env: str, proxy: str) -> bool:
     return f"{env}-{proxy}" in _all_sections()
 
 
-def tuned(proxy: str, preset: str = "best") -> list[str]:
-    """Tasks that have settings of their own for a proxy."""
-    stems = sorted(stem for stem, sections in _all_sections().items() if preset in sections)
-    tasks = [stem.removesuffix(f"-{proxy}") for stem in stems if stem.endswith(f"-{proxy}")]
-    return [task for task in tasks if task != GENERAL]
-
-
 def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
     """The presets of a task and proxy, by their names: its own, and what all tasks have."""
     general = _all_sections().get(f"{GENERAL}-{proxy}", {"best": {}})
@@ -78,9 +73,8 @@ def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
         return sections[preset]
     if preset not in names():
         raise unknown_name("preset", preset, names())
-    there, tasks = listed(list(sections)), listed(tuned(proxy, preset), 60)
-    message = f"must be one that {shortened(env)} has ({there}); got {preset}, which {tasks} have."
-    raise ConfigError(f"preset {message} Set preset=best.", "preset")
+    must = f"must be one that {shortened(env)} has ({listed(list(sections))})"
+    raise ConfigError(f"preset {must}; got {preset}. Set preset=best.", "preset")
 
 
 def settings_of(
@@ -112,22 +106,8 @@ def read_file(path: Path) -> dict[str, Any]:
     """
     try:
         values = flatten(dict(yaml.safe_load(path.read_text(encoding="utf-8"))))
-    except (OSError, ValueError, TypeError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(
-            f"preset must be a name, or a YAML file of fields; got "
-            f"{shortened(path, 40)} ({told(error)}). Set preset=best.",
-            "preset",
-        ) from error
+    except UNREADABLE as error:
+        got = f"{shortened(path, 40)} ({told(error)})"
+        must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
+        raise ConfigError(must, "preset") from error
     return {name: x for name, x in values.items() if x is not None or name not in NONE}
-
-
-def file_text(overrides: Iterable[str]) -> str:
-    """The preset file that holds overrides.
-
-    Example:
-      >>> print(file_text(["env=acrobot", "es.noise_std=0.1"]), end="")
-      env: acrobot
-      es.noise_std: 0.1
-    """
-    pairs = (override.partition("=") for override in overrides)
-    return str(yaml.safe_dump({name: parsed(text) for name, _, text in pairs}, sort_keys=False))

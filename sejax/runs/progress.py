@@ -79,8 +79,8 @@ class RunProgress(Progress, Reporter):
         if solved_score is not None:
             verdict = "solved" if is_solved else "not solved"
             verdict += f": best incumbent mean {best:.1f}, solved at {solved_score:g}"
-        title = "solved" if is_solved else "learned"
-        self.console.rule(f"{learner.proxy.task.name}: {title}", align="left")
+        ending = "solved" if is_solved else "learned"
+        self.console.rule(f"{learner.proxy.task.name}: {ending}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
@@ -94,13 +94,9 @@ class RunProgress(Progress, Reporter):
 
     def _plugin_words(self) -> str:
         """The overrides that name plugins, as `sejax.evaluate` imports only what is typed."""
-        names = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
-        agents = f"[{','.join(names)}]" if len(names) > 1 else names[0]
-        words = {
-            "env": self._config.name("env"),
-            "proxy_kind": self._config.name("proxy"),
-            "agents" if len(names) > 1 else "agent": agents,
-        }
+        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
+        env, proxy = self._config.name("env"), self._config.name("proxy")
+        words = {"env": env, "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
         return "".join(f" {name}={text}" for name, text in words.items() if ":" in text)
 
     def _plugin_arguments(self) -> str:

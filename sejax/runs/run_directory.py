@@ -5,10 +5,9 @@ It holds the configuration, the state of the learner, and all rows of `metrics.c
 changes nothing.
 """
 
-import json
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -52,7 +51,7 @@ class RunDirectory(Store):
 
     Args:
       config: of the run.
-      hint: last sentence of messages: how to choose another folder.
+      field: the field that names the folder, for messages.
 
     Attributes:
       path: the folder; made, or that of an earlier session of the same run.
@@ -64,11 +63,11 @@ class RunDirectory(Store):
       versions: of the packages that decide the numbers, as the checkpoint was written.
     """
 
-    def __init__(self, config: LearnConfig, hint: str = ""):
+    def __init__(self, config: LearnConfig, field: str = "run_dir"):
         super().__init__(
             config.resolved_run_dir,
             configuration.plain(config),
-            hint=hint,
+            field=field,
             free=FREE_FIELDS,
             completed=lambda stored: configuration.completed(stored, config),
         )
@@ -155,10 +154,6 @@ class RunDirectory(Store):
             write_text(self.path / _METRICS, csv)
         return new
 
-    def write_summary(self, **values: Any) -> None:
-        """Writes `run.json`."""
-        write_text(self.path / "run.json", json.dumps(values, indent=2) + "\n")
-
     def _as_csv(self, rows: Iterable[Mapping[str, str]]) -> str:
         """The text of `metrics.csv`, none of whose cells has a comma."""
         cells = [self.columns, *(row.values() for row in rows)]
@@ -167,8 +162,10 @@ class RunDirectory(Store):
     def _open(self) -> None:
         """Takes over what the checkpoint holds, if there is one."""
         entry = self.get(_CHECKPOINT)
-        if entry is None:
-            self._require_no_other_run()
+        if entry is None:  # then neither a run without its checkpoint, nor one of an older sejax
+            for name in filter(lambda name: (self.path / name).exists(), _SIGNS_OF_A_RUN):
+                must = "must be new or hold the checkpoint of its run"
+                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
             return
         tensors, values = entry
         try:
@@ -182,13 +179,6 @@ class RunDirectory(Store):
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = tensors
-
-    def _require_no_other_run(self) -> None:
-        """Refuses to replace the files of a run without its checkpoint, or of an older sejax."""
-        for name in _SIGNS_OF_A_RUN:
-            if (self.path / name).exists():
-                must = "must be new or hold the checkpoint of its run"
-                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a block."""
@@ -226,10 +216,8 @@ def _as_text(value: np.generic) -> str:
 
 def as_tensors(state: PyTree[Array]) -> dict[str, np.ndarray]:
     """The leaves of a pytree by their paths, as arrays that safetensors can store."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    arrays = jax.device_get([_bare(leaf) for _, leaf in leaves])  # all at once
-    names = [_STATE + jax.tree_util.keystr(path) for path, _ in leaves]
-    return dict(zip(names, arrays, strict=True))
+    arrays: dict[str, np.ndarray] = jax.device_get(_bare(_named(state)))  # all at once
+    return arrays
 
 
 def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
@@ -242,33 +230,33 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
     Raises:
       ValueError: if the structure is another one.
     """
-    paths, structure = jax.tree_util.tree_flatten_with_path(like)
-    leaves = {_STATE + jax.tree_util.keystr(path): leaf for path, leaf in paths}
-    shapes = {name: jax.eval_shape(_bare, leaf) for name, leaf in leaves.items()}
-    for name in [*shapes, *tensors]:
-        there, here = _describe(tensors.get(name)), _describe(shapes.get(name))
-        if there != here:
-            raise ValueError(f"{name} is {there}, and {here} in this version")
-    arrays = [_as_leaf(tensors[name], leaf) for name, leaf in leaves.items()]
-    state: State = jax.tree.unflatten(structure, arrays)
+    leaves = _named(like)
+    there, here = _shapes(tensors), _shapes(jax.eval_shape(_bare, leaves))
+    for name in [*here, *there]:
+        stored, expected = there.get(name, "missing"), here.get(name, "missing")
+        if stored != expected:
+            raise ValueError(f"{name} is {stored}, and {expected} in this version")
+    arrays = {name: jax.numpy.array(tensors[name]) for name in leaves}
+    restored = [
+        jax.random.wrap_key_data(arrays[name]) if _is_key(leaf) else arrays[name]
+        for name, leaf in leaves.items()
+    ]
+    state: State = jax.tree.unflatten(jax.tree.structure(like), restored)
     return state
 
 
-def _describe(array: np.ndarray | jax.ShapeDtypeStruct | None) -> str:
-    return "missing" if array is None else f"{array.dtype}{list(array.shape)}"
+def _named(tree: PyTree) -> dict[str, Array]:
+    return {_STATE + jax.tree_util.keystr(x): leaf for x, leaf in jax.tree.leaves_with_path(tree)}
 
 
 def _is_key(leaf: Array) -> bool:
     return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
 
 
-def _bare(leaf: Array) -> Array:
-    """The data of a PRNG key, the bits of a dtype that only jax has, or the leaf itself."""
-    if _is_key(leaf):
-        return jax.random.key_data(leaf)
-    return leaf.view(f"uint{8 * leaf.dtype.itemsize}") if leaf.dtype.kind == "V" else leaf
+def _bare(leaves: dict[str, Array]) -> dict[str, Array]:
+    """PRNG keys as their data."""
+    return {name: jax.random.key_data(x) if _is_key(x) else x for name, x in leaves.items()}
 
 
-def _as_leaf(array: np.ndarray, like: Array) -> Array:
-    new = jax.numpy.array(array)
-    return jax.random.wrap_key_data(new) if _is_key(like) else new.view(like.dtype)
+def _shapes(arrays: Mapping[str, np.ndarray | Array]) -> dict[str, str]:
+    return {name: f"{x.dtype}{list(x.shape)}" for name, x in arrays.items()}

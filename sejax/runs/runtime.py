@@ -8,7 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
-from jax._src import xla_bridge
 
 from sejax.ops import files
 from sejax.training import require_modes
@@ -27,15 +26,10 @@ def available_cores() -> int:
     return max(1, int(cores))
 
 
-def is_started() -> bool:
-    """Whether jax has its devices already."""
-    return bool(xla_bridge.backends_are_initialized())
-
-
 def platform_error() -> str:
     """The message for a `JAX_PLATFORMS` that jax lacks, of which other code fails; else empty."""
     platforms = os.environ.get("JAX_PLATFORMS")
-    if not platforms or is_started():
+    if not platforms:
         return ""
     try:
         jax.devices()
@@ -46,7 +40,7 @@ def platform_error() -> str:
 
 
 def configure_xla(num_devices: int | None = None) -> None:
-    """Sets XLA up for one CPU device per core; must run before jax first computes.
+    """Sets XLA up for one CPU device per core; without effect once jax has computed.
 
     A flag that the user has set in `XLA_FLAGS` stays. The time limits of collectives are lifted:
     devices reach the gather at the end of a generation at very different times, and XLA would
@@ -54,11 +48,7 @@ def configure_xla(num_devices: int | None = None) -> None:
 
     Args:
       num_devices: CPU devices; None for one per core.
-
-    Once jax has computed, the flags would have no effect: then nothing is done.
     """
-    if is_started():
-        return
     count = num_devices or available_cores()
     flags = {
         "--xla_force_host_platform_device_count": count,
@@ -98,28 +88,15 @@ def configure_jax() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def machine() -> dict[str, str | int]:
-    """What kind of machine this is; not which."""
-    models = [x.partition(":")[2].strip() for x in _cpu_lines() if x.startswith("model name")]
-    return {
-        "system": f"{platform.system()} {platform.release()}",
-        "processor": models[0] if models else platform.processor() or platform.machine(),
-        "cores": available_cores(),
-    }
-
-
 def cpu_fingerprint() -> str:
     """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
-    fields = ("model name", "flags", "Features")
-    lines = sorted({x for x in _cpu_lines() if x.startswith(fields)}) or [platform.processor()]
+    lines = [platform.processor()]
+    with contextlib.suppress(OSError):
+        of_cores = Path("/proc/cpuinfo").read_text().splitlines()
+        fields = ("model name", "flags", "Features")
+        lines = sorted({x for x in of_cores if x.startswith(fields)}) or lines
     digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
     return f"{platform.machine()}-{digest}"
-
-
-def _cpu_lines() -> list[str]:
-    with contextlib.suppress(OSError):
-        return Path("/proc/cpuinfo").read_text().splitlines()
-    return []
 
 
 def versions() -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import platform
 import signal
 import threading
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 
 from sejax.bilevel import Bilevel, LearnState
-from sejax.proxies.header import agents_of
+from sejax.ops.files import write_text
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
@@ -29,7 +30,7 @@ PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "nump
 
 def run(
     config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
-) -> str:
+) -> dict[str, Any]:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
     Args:
@@ -39,8 +40,8 @@ def run(
       report: hears how it goes on.
 
     Returns:
-      How it ended: finished, solved, or diverged: a run of whose agents none has ended with finite
-      numbers stops, and has no proxy.
+      What `run.json` holds. `ended` is finished, solved, or diverged: a run of whose agents none
+      has ended with finite numbers stops, and has no proxy.
 
     Raises:
       ConfigError: if the folder's state is that of another version.
@@ -69,26 +70,27 @@ def run(
                     report.on_generation(generation)
                     tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
-                draw(directory, learner)
+                draw(config, directory, learner)
                 drawn = time.monotonic()
-        draw(directory, learner)
+        draw(config, directory, learner)
     generations, agents = directory.finished_generations, learner.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
-    directory.write_summary(
-        ended=ended,
-        best_score=float(state.best_score),
-        solved_score=learner.solved_score,
-        wall_s=round(start_wall_s + time.monotonic(), 1),
-        cpu_s=round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
-        generations=generations,
-        agents=generations * agents,
-        train_steps=round(steps * agents),
-        real_steps=int(directory.last("env_steps_total")),
-        devices=[str(device) for device in jax.devices()],
-        machine=runtime.machine(),
-        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
-    )
-    return ended
+    summary = {
+        "ended": ended,
+        "best_score": float(state.best_score),
+        "solved_score": learner.solved_score,
+        "wall_s": round(start_wall_s + time.monotonic(), 1),
+        "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
+        "generations": generations,
+        "agents": generations * agents,
+        "train_steps": round(steps * agents),
+        "real_steps": int(directory.last("env_steps_total")),
+        "devices": [str(device) for device in jax.devices()],
+        "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
+        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
+    }
+    write_text(directory.path / "run.json", json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
 def _begin(
@@ -205,12 +207,11 @@ def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, f
         )
 
 
-def draw(directory: RunDirectory, learner: Bilevel) -> None:
+def draw(config: LearnConfig, directory: RunDirectory, learner: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
-        path, config = directory.path / "learning_curve.png", directory.config
-        title = f"{config['env']['name']}, {str(config['proxy']['name']).upper()}, "
-        title += " + ".join(agent["name"] for agent in agents_of(config).values())
+        path = directory.path / "learning_curve.png"
+        title = ", ".join(map(config.name, ("env", "proxy", "agent")))
         plots.learning_curve(directory.rows, learner.solved_score, path, title)
 
 

@@ -28,7 +28,6 @@ class Store:
       folder: the folder, made with the first entry or lock.
       settings: plain values in nested mappings, on which all entries depend.
       field: the field that names the folder, for messages.
-      hint: last sentence of messages: how to choose another folder.
       free: groups and fields of the first level that may differ: how to compute, not what.
       completed: adds to stored settings the fields that an older version did not write.
 
@@ -53,13 +52,12 @@ class Store:
         settings: Mapping[str, Any],
         *,
         field: str = "run_dir",
-        hint: str = "",
         free: Collection[str] = (),
         completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     ):
         self.folder = folder
         self.settings: dict[str, Any] = json.loads(json.dumps(settings))
-        self._field, self._hint = field, hint or f"Set {field}=FOLDER."
+        self._field, self._hint = field, f"Set {field}=FOLDER."
         self._free, self._completed = free, completed
         self._lock: FolderLock | None = None
         self._is_used = False

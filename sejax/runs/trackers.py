@@ -4,7 +4,6 @@ A tracker hears of each generation after the run directory has it. It adds nothi
 cannot stop it.
 """
 
-import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import yaml
 
 from sejax.options import registry, told
+from sejax.options.parts import Makes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,32 +83,29 @@ class Tracker(Protocol):
 class GuardedTracker:
     """The tracker of a run, made at its first generation, dropped with one message if it raises."""
 
-    def __init__(self, config: Any, run: TrackedRun, say: Callable[[str], None]):
+    def __init__(self, config: Makes[Tracker], run: TrackedRun, say: Callable[[str], None]):
         """The tracker of a configuration; `say` takes the message."""
         self._config, self._run, self._say = config, run, say
         self._tracker: Tracker | None = None
-        self._is_dropped = False
+        self._has_failed = False
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        self._call("on_generation", info)
+        if not self._has_failed:
+            self._call("on_generation", info)
 
     def close(self) -> None:
         if self._tracker is not None:
             self._call("close")
 
     def _call(self, method: str, *arguments: FinishedGeneration) -> None:
-        if self._is_dropped:
-            return
         try:
             self._tracker = self._tracker or self._config.make(self._run)
             getattr(self._tracker, method)(*arguments)
         except (Exception, SystemExit) as error:  # foreign code may raise anything
-            self._is_dropped = True
-            name = registry.name_of("tracker", self._config)
-            self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
-            if method != "close" and self._tracker is not None:
-                with contextlib.suppress(Exception, SystemExit):
-                    self._tracker.close()
+            if not self._has_failed:
+                name = registry.name_of("tracker", self._config)
+                self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
+            self._has_failed = True
 
 
 @dataclass(frozen=True, kw_only=True)

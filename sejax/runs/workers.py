@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
-from sejax.generation import Candidates, Trainings
+from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import ConfigError, FailedError, Options, counts, option, shortened, told
@@ -35,7 +35,7 @@ from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
 Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
-CAPACITY = 16  # trainings in the largest shares, where batches follow one another
+BATCH, SHARE = 16, 4  # trainings in a batch whose width nothing says; least ones in a share
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
 
@@ -71,13 +71,11 @@ class Chunks:
         self.compiled[length] = jitted.lower(state).compile()
 
     def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations; the buffers of the state are donated.
+        """Runs `length` generations, after `compile`; the buffers of the state are donated.
 
         Returns:
           The state, and an info with leaves `[length, ...]`.
         """
-        if length not in self.compiled:
-            self.compile(length)
         state, info = self.compiled[length](state)
         return state, info
 
@@ -95,7 +93,6 @@ class LocalConfig(Options):
     """This process computes everything: one compiled program over its devices."""
 
     group: ClassVar[str] = "machines"
-    is_elsewhere: ClassVar[bool] = False
 
     def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
         """The compiled generations of a run."""
@@ -140,9 +137,8 @@ class RayConfig(Options):
             fix = "Start one with ray start --head, or set machines.address=local."
             message = f"{must}; got {self.address} ({told(error)}). {fix}"
             raise ConfigError(message, "machines.address") from error
-        compute = functools.partial(_on_cluster, self, setup_of(config))
         try:
-            yield RemoteChunks(config, functools.partial(num_workers, self), compute)
+            yield RemoteChunks(config, functools.partial(_on_cluster, self, setup_of(config)))
         finally:
             ray.shutdown()
 
@@ -151,13 +147,13 @@ class RayConfig(Options):
 
 
 def portion_sizes(learner: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
-    """Trainings of each agent in a batch, and most of them in a share, which is whole batches.
+    """Trainings of each agent in a batch, and in a share, which is whole batches.
 
     They are the same for any number of workers, because sums over batches of other widths round
     otherwise.
     """
-    widths = [num_parallel or width or CAPACITY for width in learner.evaluate.widths]
-    return [(width, width * -(-CAPACITY // width)) for width in widths]
+    widths = [num_parallel or width or BATCH for width in learner.evaluate.widths]
+    return [(width, width * -(-SHARE // width)) for width in widths]
 
 
 class RemoteChunks(Chunks):
@@ -168,7 +164,6 @@ class RemoteChunks(Chunks):
 
     Args:
       config: of the run.
-      num_workers: workers that there are now.
       compute: what `score` returns for each share, in their order.
 
     Attributes:
@@ -178,12 +173,11 @@ class RemoteChunks(Chunks):
     def __init__(
         self,
         config: LearnConfig,
-        num_workers: Callable[[], int],
         compute: Callable[[Sequence[Portion]], Sequence[tuple[Outcome, float]]],
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
-        self._num_workers, self._compute = num_workers, compute
-        self._sizes = portion_sizes(self.learner, config.num_parallel)
+        self._compute = compute
+        self._sizes = [size for _, size in portion_sizes(self.learner, config.num_parallel)]
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, of which chunks of any length are made."""
@@ -200,8 +194,9 @@ class RemoteChunks(Chunks):
 
         def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
             candidates = learner.ask(state)
-            outcome = learner.evaluate.joined(by_agent)
-            return learner.tell(state, candidates, outcome), _sent(learner, candidates)
+            trainings = learner.evaluate.trainings(candidates)
+            sent = [dataclasses.replace(x, key=jax.random.key_data(x.key)) for x in trainings]
+            return learner.tell(state, candidates, learner.evaluate.joined(by_agent)), sent
 
         def evaluate(state: LearnState) -> list[Outcome]:
             trainings = learner.evaluate.trainings(learner.ask(state))
@@ -235,11 +230,8 @@ class RemoteChunks(Chunks):
     def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
         """The outcomes of each agent's trainings, leaves `[training, ...]`."""
         shares: list[Portion] = []
-        for agent, (trainings, (width, most)) in enumerate(zip(by_agent, self._sizes, strict=True)):
-            total = len(trainings.active)
-            # Two shares for each worker, so that none waits long for the last one.
-            size = min(most, width * -(-total // (2 * self._num_workers() * width)))
-            for start in range(0, total, size):
+        for agent, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
+            for start in range(0, len(trainings.active), size):
                 part = slice(start, start + size)
                 shares.append((agent, jax.tree.map(lambda x, part=part: x[part], trainings)))
         parts: list[list[Outcome]] = [[] for _ in by_agent]
@@ -247,14 +239,6 @@ class RemoteChunks(Chunks):
             parts[agent].append(outcome)
             self.cpu_s += cpu_s
         return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
-
-
-def _sent(learner: Bilevel, candidates: Candidates) -> list[Trainings]:
-    """The trainings of each agent, with keys as data."""
-    return [
-        dataclasses.replace(trainings, key=jax.random.key_data(trainings.key))
-        for trainings in learner.evaluate.trainings(candidates)
-    ]
 
 
 # --- the cluster ----------------------------------------------------------------------------------
@@ -364,5 +348,4 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 def _use_one_core() -> None:
     """Keeps this process on one CPU core, whatever else there is; before jax first computes."""
     runtime.configure_xla(1)
-    if not runtime.is_started():
-        jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_platforms", "cpu")

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 from sejax import envs
 from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, registry, require
+from sejax.options import registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
-from sejax.runs.config import EvaluateConfig, require_fit, require_learning
-from sejax.training import TrainingConfig, require_reachable
+from sejax.runs.config import EvaluateConfig
+from sejax.training import TrainingConfig
 
 
 class World(NamedTuple):
@@ -38,11 +38,10 @@ class Setup(NamedTuple):
 
 def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
-    if config.env is None:
-        raise ConfigError("env must be given with proxy=real. Set env=cartpole.", "env")
-    task = envs.make(config.env)
+    require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
+    task = envs.make(str(config.env))
     for key in config.agents:
-        require_fit(config, key, task, task.name)
+        config.require_fit(key, task, task.name)
     trainings = dict.fromkeys(config.agents, config.real_training)
     worlds = {"the real task": World(task.env, task.params, trainings)}
     folder = Path(config.out_dir or f"runs/evaluate-{as_file_name(task.name)}")
@@ -55,14 +54,13 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     env, task = proxy.env, proxy.task
     real_training, trainings = _real_training(config, proxy), {}
     for key, agent in config.agents.items():
-        require_fit(config, key, task, task.name)
+        config.require_fit(key, task, task.name)
         group, training = "real_training", real_training
         if config.training_from == "config":
             group, training = "training", config.training
         elif not env.is_real:  # else agents train and stop as on the real task
             training = _as_learned(proxy, config, agent)
-        require_reachable(group, training, env.max_steps)
-        require_learning(config, key, group, training, env.config, task)
+        config.require_learning(key, group, training, env.config, task)
         trainings[key] = training
     worlds = {"the proxy": World(env, proxy.params, trainings)}
     if config.baseline:

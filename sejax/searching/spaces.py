@@ -23,8 +23,9 @@ from typing import Any
 import yaml
 from optuna import distributions
 
-from sejax.options import ConfigError, as_text, nearest, require, shortened, told
+from sejax.options import ConfigError, as_text, is_number, nearest, require, shortened, told
 from sejax.options.plain import split
+from sejax.runs.preset_files import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -60,12 +61,12 @@ class Dimension:
             value = f"{1 - value if self.is_inverse else value:.{DIGITS}g}"
         return str(value)
 
-    def parameter_of(self, value: Any) -> Any:
+    def parameter_of(self, value: float | str | None) -> float | str | None:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
         try:
             if isinstance(self.distribution, distributions.CategoricalDistribution):
                 value = as_text(value)
-            elif self.is_inverse:
+            elif self.is_inverse and is_number(value):
                 value = round(1 - value, 12)
             is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
         except (TypeError, ValueError):
@@ -124,11 +125,6 @@ def _distribution(text: str, tags: list[str]) -> distributions.BaseDistribution:
     raise ValueError("bounds, tags or values are wrong")
 
 
-def names() -> list[str]:
-    """The presets."""
-    return sorted(file.stem for file in FOLDER.glob("*.yaml"))
-
-
 def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     """The dimensions of a preset, or of a file of your own.
 
@@ -148,15 +144,9 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
             for field, text in with_agent.get(agent, {}).items():
                 if group == "agent" or field.startswith("agent."):
                     texts[field.replace("agent", group, 1)] = text
-    except (
-        OSError,
-        yaml.YAMLError,
-        AttributeError,
-        TypeError,
-        ValueError,
-        RecursionError,
-    ) as error:
-        must = f"must be one of {', '.join(nearest(name, names()))}, or a YAML file of ranges"
+    except UNREADABLE as error:
+        known = nearest(name, (file.stem for file in FOLDER.glob("*.yaml")))
+        must = f"must be one of {', '.join(known)}, or a YAML file of ranges"
         got = f"{shortened(name)} ({told(error)[:120]})"
         raise ConfigError(f"space {must}; got {got}. Set space=paper_se.", "space") from error
     foreign = [text for text in texts.values() if ":" in str(text)]

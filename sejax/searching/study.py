@@ -106,20 +106,20 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     chunks = workers.make_chunks(config)
 
     def run(generations: int) -> Progress:
-        means, train_steps, computed, ends = [], 0, [], []
+        means, summaries = [], []
         for seed in (config.seed + offset for offset in seeds):
             run_dir = str(folder if len(seeds) == 1 else folder / f"seed{seed}")
             one = dataclasses.replace(config, seed=seed, generations=generations, run_dir=run_dir)
-            with RunDirectory(one, "Set search_dir=FOLDER.") as directory:
-                ends.append(session.run(one, directory, chunks))
+            with RunDirectory(one, "search_dir") as directory:
+                summaries.append(session.run(one, directory, chunks))
             of_run = [float(row["incumbent_mean"]) for row in directory.rows[:generations]]
-            computed.append(len(of_run))
             means.append(of_run + of_run[-1:] * (generations - len(of_run)))
-            steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
-            train_steps += round(steps * chunks.learner.strategy.num_evaluations)
         scores = np.mean(means, axis=0)
         scores[~np.isfinite(scores)] = np.nan
-        return Progress(scores, train_steps, float(np.mean(computed)), set(ends) == {"solved"})
+        train_steps = sum(summary["train_steps"] for summary in summaries)
+        computed = np.mean([min(summary["generations"], generations) for summary in summaries])
+        is_over = all(summary["ended"] == "solved" for summary in summaries)
+        return Progress(scores, train_steps, float(computed), is_over)
 
     return run
 
