@@ -411,8 +411,7 @@ def shuffled(
 
     Each epoch's steps are sorted by random bits, whose last ones are the step's number: a sort of
     single numbers takes a fifth of the time of `jax.random.permutation`. The bits are MurmurHash3's
-    finaliser of counters that start at random, since XLA would move what threefry does with
-    counters that start at 0 out of the learning phase, into every step.
+    finaliser of counters that start at random.
     """
     size = num_steps // num_minibatches
     counter = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
