@@ -21,7 +21,7 @@ from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
-from sejax.ops.loops import while_any_active
+from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
 from sejax.ops.parallel import in_batches_on_cpu
 from sejax.options import (
     LARGEST,
@@ -305,9 +305,11 @@ class _Loop:
         if self.test_fn is not None:
             curve["test_returns"] = no_returns
         learns_every = self.buffers(state)[0].learns_every
-        body = self.step if learns_every == 1 else partial(self.rollout, learns_every)
+        body, per_check = self.step, STEPS_PER_CHECK
+        if learns_every > 1:
+            body, per_check = partial(self.rollout, learns_every), 1
         (stored, curve), state = while_any_active(
-            body, (stored, curve), state, (key_steps, env_params)
+            body, (stored, curve), state, (key_steps, env_params), per_check
         )
         return TrainResult(
             agent_state=state.agent_state,

@@ -128,7 +128,8 @@ def adam_step(
     total = sum_over_batch(
         lambda columns: jax.grad(sum_of_losses)(params, *columns), columns, hparams.batch_size
     )
-    gradient = jax.tree.map(lambda x: x / num_columns(columns[0]), total)
+    count = num_columns(columns[0])
+    gradient = jax.tree.map(lambda x: x / count, total)
     return moved(params, opt_state, gradient, hparams.learning_rate)
 
 
