@@ -7,6 +7,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
