@@ -146,9 +146,6 @@ class Mixture:
             if numbers.size:
                 of_agent = scores[numbers]
                 mean = jnp.where(jnp.isfinite(mean), mean, finite_mean(of_agent))
-                compared = compared.at[numbers].set(_advantages(of_agent, mean))
+                advantages = jnp.where(is_tie(of_agent, mean), 0.0, of_agent - mean)
+                compared = compared.at[numbers].set(advantages)
         return compared, jnp.float32(0)
-
-
-def _advantages(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
-    return jnp.where(is_tie(scores, incumbent), 0.0, scores - incumbent)
