@@ -231,7 +231,7 @@ def test_another_configuration_is_refused_with_what_differs(run):
     assert "seed (7 there, 3 here)" in refused(run, seed=3)
     other = RunDirectory(sejax.config(["proxy=rn", f"run_dir={run}"]))
     with pytest.raises(ConfigError, match=r"and \d+ more"):
-        other.lock()
+        other.__enter__()
 
 
 def test_fields_that_change_no_number_may_change(run):
@@ -242,7 +242,7 @@ def test_fields_that_change_no_number_may_change(run):
 @pytest.mark.parametrize("name", ["file/run", "a\0b", "/proc/run"])
 def test_a_folder_that_cannot_be_made_is_one_message(tmp_path, name):
     (tmp_path / "file").write_text("")
-    assert refusal(open_run(tmp_path / name).lock).field == "run_dir"
+    assert refusal(open_run(tmp_path / name).__enter__).field == "run_dir"
 
 
 def test_a_run_without_a_generation_leaves_no_folder(tmp_path):

@@ -7,7 +7,7 @@ changes nothing.
 
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import jax
 import numpy as np
@@ -80,19 +80,20 @@ class RunDirectory(Store):
         self.columns = (*COLUMNS, *of_agents)
         self._tensors: dict[str, np.ndarray] | None = None
 
-    def lock(self) -> None:
+    def __enter__(self) -> Self:
         """Takes the folder, and reads what the checkpoint holds, if there is one.
 
         Raises:
           ConfigError: if the folder holds another run or a damaged one, is in use by another
             process, or cannot be written.
         """
-        super().lock()
+        super().__enter__()
         try:
             self._open()
         except BaseException:
-            self.release()
+            self.__exit__()
             raise
+        return self
 
     @property
     def finished_generations(self) -> int:
