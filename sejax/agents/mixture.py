@@ -114,13 +114,7 @@ class Mixture:
             f"{shortened(self.weights)}. Set es.population_size={2 * max(num_dealt, self.size)}.",
         )
         mirrored = (0, num_dealt) if antithetic else (0,)
-        return tuple(
-            np.array([i + first for first in mirrored for i in hand], int) for hand in hands
-        )
-
-    def num_evals(self, num_incumbent_evals: int) -> int:
-        """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
-        return -(-num_incumbent_evals // self.size) * self.size
+        return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 
     def comparable(
         self,

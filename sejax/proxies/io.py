@@ -489,9 +489,7 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
     if task is not None:
         limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
         wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))
-        must = (
-            f"must have the spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
-        )
+        must = f"must have spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
         require(learned.interface | limit == task.interface, "task", must)
     return registry.make("proxy", proxy, real)
 
