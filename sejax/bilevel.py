@@ -72,7 +72,6 @@ class Bilevel:
     scoring: Scoring  # by which agents and which objective
     evaluate: GenerationEvaluator
     unravel: Callable[[Array], PyTree]  # a flat vector [dims] to the proxy's weights
-    num_dims: int
     stop_when_solved: bool
 
     @property
@@ -253,7 +252,6 @@ def make_bilevel(
         scoring=scoring,
         evaluate=GenerationEvaluator(proxy, unravel, training, scoring, devices, num_parallel),
         unravel=unravel,
-        num_dims=num_dims,
         stop_when_solved=stop_when_solved,
     )
     require(

@@ -215,7 +215,16 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-    _require_evaluation(task, training)
+    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_part("training", TrainingConfig, training)
+    budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
+    require(
+        task.max_steps <= 1000 * budget,
+        "env.max_steps",
+        f"must end a test episode within 1,000 times the training budget of {training.max_steps} "
+        f"steps, because an agent may never end it; got {task.max_steps:,} for {task.name}. Set "
+        "env.max_steps=N, or Task(max_steps=N).",
+    )
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)
@@ -247,20 +256,6 @@ def make_evaluator(
     run = in_batches_on_cpu(agent.fresh(make_run), num_parallel_on_cpu(agent, training))
     return lambda key, env_params, active=True, test_params=None: run(
         key, env_params, jnp.asarray(active), test_params
-    )
-
-
-def _require_evaluation(task: Task, training: TrainingConfig) -> None:
-    """Checks what tests need: a task whose episodes end within a bearable time."""
-    require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
-    require_part("training", TrainingConfig, training)
-    budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
-    require(
-        task.max_steps <= 1000 * budget,
-        "env.max_steps",
-        f"must end a test episode within 1,000 times the training budget of {training.max_steps} "
-        f"steps, because an agent may never end it; got {task.max_steps:,} for {task.name}. Set "
-        "env.max_steps=N, or Task(max_steps=N).",
     )
 
 

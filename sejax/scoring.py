@@ -100,7 +100,8 @@ class Scoring:
         must = "must compare scores within a generation with several agents or a curriculum"
         message = f"{must}; got one that remembers scores. Set es=nes."
         require(has_one_unit or not strategy.remembers_scores, "es", message)
-        num_evals = mixture.num_evals(strategy.evaluations.num_incumbent_evals)
+        # Equally many with each agent.
+        num_evals = -(-strategy.evaluations.num_incumbent_evals // mixture.size) * mixture.size
         return cls(
             objective=objective,
             mixture=mixture,

@@ -62,7 +62,8 @@ def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_
 
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
 def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
-    assert mixture(num).num_evals(asked) == evals
+    bilevel = make_bilevel(task=TASK, agent=mixture(num), es=NESConfig(num_incumbent_evals=asked))
+    assert bilevel.strategy.evaluations.num_incumbent_evals == evals
 
 
 @pytest.mark.parametrize(

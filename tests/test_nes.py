@@ -215,7 +215,7 @@ def another_of_evosax(num_dims):
 def test_a_strategy_that_remembers_scores_wants_them_in_one_unit():
     config = sejax.config(["env=gridworld_2x2"])
     parts = config.parts()
-    es = another_of_evosax(make_bilevel(**parts).num_dims)
+    es = another_of_evosax(make_bilevel(**parts).init(jax.random.key(0)).best.size)
     assert sejax.make_learner(**{**parts, "es": es})
     for more in (["agents=[q_learning,sarsa]"], ["objective.first_eval_steps=2"]):
         parts = sejax.config(["env=gridworld_2x2", *more]).parts()

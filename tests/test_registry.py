@@ -130,7 +130,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
 SEVERAL = """
 import dataclasses
 import sejax
-from sejax.es.nes import NESConfig, make_nes
+from sejax.es.nes import NESConfig
 
 @dataclasses.dataclass(frozen=True)
 class Scaled:
@@ -164,7 +164,7 @@ class Vague(Plain):
 a_number = 3
 
 def search(num_dims, pairs: int = 2) -> sejax.Strategy:
-    return make_nes(NESConfig(population_size=pairs), num_dims)
+    return NESConfig(population_size=pairs).make(num_dims)
 
 def task(sizes: list[int] = [1, 2], length: float = None) -> 'sejax.Task':
     task = sejax.envs.make('cartpole')

@@ -79,7 +79,7 @@ def results(path: Path) -> dict[str, object]:
 def refused(path: Path, **changes) -> str:
     """The message of a refusal that leaves every file as it is."""
     before = content(path)
-    error = refusal(open_run(path, **changes).lock)
+    error = refusal(open_run(path, **changes).__enter__)
     assert error.field == "run_dir" and content(path) == before
     return str(error)
 
@@ -231,7 +231,7 @@ def test_another_configuration_is_refused_with_what_differs(run):
     assert "seed (7 there, 3 here)" in refused(run, seed=3)
     other = RunDirectory(sejax.config(["proxy=rn", f"run_dir={run}"]))
     with pytest.raises(ConfigError, match=r"and \d+ more"):
-        other.lock()
+        other.__enter__()
 
 
 def test_fields_that_change_no_number_may_change(run):
@@ -242,7 +242,7 @@ def test_fields_that_change_no_number_may_change(run):
 @pytest.mark.parametrize("name", ["file/run", "a\0b", "/proc/run"])
 def test_a_folder_that_cannot_be_made_is_one_message(tmp_path, name):
     (tmp_path / "file").write_text("")
-    assert refusal(open_run(tmp_path / name).lock).field == "run_dir"
+    assert refusal(open_run(tmp_path / name).__enter__).field == "run_dir"
 
 
 def test_a_run_without_a_generation_leaves_no_folder(tmp_path):
@@ -351,7 +351,7 @@ def test_a_folder_is_free_again_after_a_refusal_or_a_session(run):
     refused(run, seed=3)
     for _ in range(2):
         with open_run(run):
-            refusal(open_run(run).lock)
+            refusal(open_run(run).__enter__)
 
 
 def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
@@ -369,10 +369,10 @@ def test_a_run_of_a_version_without_a_field_goes_on_with_its_default(tmp_path):
         directory.save(state_after(1), info_of(0, 1), 1.0, 1.0)
     change_checkpoint(tmp_path, lambda manifest: manifest["config"]["proxy"].pop("output_scale"))
     for field in ("proxy.output_scale", "es.noise_std"):
-        said = str(refusal(RunDirectory(sejax.config([*words, f"{field}=0.5"])).lock))
+        said = str(refusal(RunDirectory(sejax.config([*words, f"{field}=0.5"])).__enter__))
         assert re.search(rf"{field} \(\S+ there, 0.5 here\)\. Set", said)
     with RunDirectory(sejax.config(words)):
         pass
     change_checkpoint(tmp_path, lambda manifest: manifest["config"]["es"].update(fashion=1))
-    said = str(refusal(RunDirectory(sejax.config(words)).lock))  # which had other fields
+    said = str(refusal(RunDirectory(sejax.config(words)).__enter__))  # which had other fields
     assert "es.fashion (1 there, None here)" in said

@@ -99,11 +99,11 @@ def test_a_folder_is_a_processs_own_until_it_is_killed_and_unused_it_is_removed(
     )  # fmt: skip
     with process:
         assert process.stdout.readline() == "held\n"
-        assert refused(Store(folder, SETTINGS).lock) == "run_dir"
+        assert refused(Store(folder, SETTINGS).__enter__) == "run_dir"
         process.send_signal(signal.SIGKILL)
         process.wait(timeout=60)
     with Store(folder, SETTINGS) as store:
-        assert refused(Store(folder, SETTINGS).lock) == "run_dir"
+        assert refused(Store(folder, SETTINGS).__enter__) == "run_dir"
         store.put("rounds")
     assert store.get("rounds") == ({}, {})
     with Store(tmp_path / "other", SETTINGS):

@@ -179,27 +179,27 @@ def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
 def test_every_drawn_agent_finds_the_smallest_network_with_room():
     config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
     varied = make_agent(config, envs.make("cartpole"), varied=True).varied
-    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
+    variants, _, values = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
     bounds = ranges_of(config)
-    assert set(draws.values) == set(bounds)
+    assert set(values) == set(bounds)
     sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
     lengths = [raveled(shapes_of(x.init, KEY, x.hparams).params).size for x in varied.agents]
-    hidden, depths = draws.values["hidden_size"].tolist(), draws.values["num_layers"].tolist()
-    for variant, width, depth in zip(draws.variant.tolist(), hidden, depths, strict=True):
+    hidden, depths = values["hidden_size"].tolist(), values["num_layers"].tolist()
+    for variant, width, depth in zip(variants.tolist(), hidden, depths, strict=True):
         size = min(size for size in sizes[int(depth)] if size >= width)
         inner = (int(depth) - 1) * size * (size + 1)
         assert lengths[variant] == size * 5 + inner + 2 * (size + 1)
-    assert len(set(draws.variant.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
+    assert len(set(variants.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
 
 
 def test_the_agent_inside_an_exploring_one_is_varied():
     varied = make_agent(QLearningConfig(), envs.make("gridworld_2x2"), CountBasedConfig(), True)
     (variant,) = varied.varied.agents
-    drawn = jax.jit(varied.varied.draw)(jax.random.key(0))
-    assert drawn.variant == 0
-    expected = variant.hparams.agent.replace(**drawn.values)
-    assert drawn.hparams == variant.hparams.replace(agent=expected)
-    assert drawn.values["discount"] != variant.hparams.agent.discount
+    number, hparams, values = jax.jit(varied.varied.draw)(jax.random.key(0))
+    assert number == 0
+    expected = variant.hparams.agent.replace(**values)
+    assert hparams == variant.hparams.replace(agent=expected)
+    assert values["discount"] != variant.hparams.agent.discount
 
 
 def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key():
@@ -210,12 +210,12 @@ def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key()
     train = jax.jit(sejax.make_evaluator(varied, task.env, task, training))
     draw = jax.jit(lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key)))
     key = jax.random.key(0)
-    drawn, values = draw(key)
-    assert drawn.variant > 0 and drawn.values == values
+    (number, hparams, drawn), values = draw(key)
+    assert number > 0 and drawn == values
     for name in ("learning_rate", "batch_size", "hidden_size"):
-        assert getattr(drawn.hparams, name) == values[name]
-    assert drawn.hparams.discount == 0.9  # what is not varied stays as it was configured
-    variant = varied.varied.agents[int(drawn.variant)]
-    variant = dataclasses.replace(variant, hparams=drawn.hparams)
+        assert getattr(hparams, name) == values[name]
+    assert hparams.discount == 0.9  # what is not varied stays as it was configured
+    variant = varied.varied.agents[int(number)]
+    variant = dataclasses.replace(variant, hparams=hparams)
     alone = jax.jit(sejax.make_evaluator(variant, task.env, task, training))
     assert_close(train(key, task.params), alone(key, task.params), rtol=1e-4, atol=1e-5)

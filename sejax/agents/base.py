@@ -129,28 +129,14 @@ class Agent:
         draw, runs = self.varied.draw, [make_run(agent) for agent in self.varied.agents]
 
         def run(key: Array, *args: PyTree) -> T:
-            drawn = draw(drawing_key(key))
-            return jax.lax.switch(drawn.variant, runs, key, *args, drawn.hparams)
+            variant, hparams, _ = draw(drawing_key(key))
+            return jax.lax.switch(variant, runs, key, *args, hparams)
 
         return run
 
     def drawn_values(self, key: Array) -> dict[str, Array]:
         """The hyperparameters that `fresh` draws for a training with this key, by name."""
-        return {} if self.varied is None else self.varied.draw(drawing_key(key)).values
-
-
-class Draw(NamedTuple):
-    """Hyperparameters of one training.
-
-    Attributes:
-      variant: index of the agent in `Varied.agents`, `[]` int32.
-      hparams: its traced hyperparameters.
-      values: what was drawn, `[]` each, by the names of the configuration's fields.
-    """
-
-    variant: Array
-    hparams: Hparams
-    values: dict[str, Array]
+        return {} if self.varied is None else self.varied.draw(drawing_key(key))[2]
 
 
 class Varied(NamedTuple):
@@ -158,11 +144,12 @@ class Varied(NamedTuple):
 
     Attributes:
       agents: agents of several sizes, of which each training takes one.
-      draw: `key -> Draw`, which agent and which hyperparameters.
+      draw: `key -> (variant, hparams, values)`: the index of the training's agent, `[]` int32; its
+        traced hyperparameters; and what was drawn, `[]` each, by the configuration's fields.
     """
 
     agents: tuple[Agent, ...]
-    draw: Callable[[Array], Draw]
+    draw: Callable[[Array], tuple[Array, Hparams, dict[str, Array]]]
 
 
 def drawing_key(key: Array) -> Array:

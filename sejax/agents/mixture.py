@@ -114,13 +114,7 @@ class Mixture:
             f"{shortened(self.weights)}. Set es.population_size={2 * max(num_dealt, self.size)}.",
         )
         mirrored = (0, num_dealt) if antithetic else (0,)
-        return tuple(
-            np.array([i + first for first in mirrored for i in hand], int) for hand in hands
-        )
-
-    def num_evals(self, num_incumbent_evals: int) -> int:
-        """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
-        return -(-num_incumbent_evals // self.size) * self.size
+        return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 
     def comparable(
         self,
@@ -146,9 +140,6 @@ class Mixture:
             if numbers.size:
                 of_agent = scores[numbers]
                 mean = jnp.where(jnp.isfinite(mean), mean, finite_mean(of_agent))
-                compared = compared.at[numbers].set(_advantages(of_agent, mean))
+                advantages = jnp.where(is_tie(of_agent, mean), 0.0, of_agent - mean)
+                compared = compared.at[numbers].set(advantages)
         return compared, jnp.float32(0)
-
-
-def _advantages(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
-    return jnp.where(is_tie(scores, incumbent), 0.0, scores - incumbent)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentConfig, Draw, Varied, with_hparams
+from sejax.agents.base import Agent, AgentConfig, Hparams, Varied, with_hparams
 from sejax.ops import cpu
 from sejax.options import marks, require
 
@@ -122,18 +122,15 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
             for depth, size in shapes
         ]
 
-    def draw(key: Array) -> Draw:
+    def draw(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
         keys = jax.random.split(key, len(ranges))
         values = {
             name: draw_value(k, bounds)
             for k, (name, bounds) in zip(keys, ranges.items(), strict=True)
         }
         traced = {name: x for name, x in values.items() if name != "num_layers"}
-        return Draw(
-            variant=smallest_with_room(shapes, values),
-            hparams=with_hparams(variants[0].hparams, traced),
-            values=values,
-        )
+        hparams = with_hparams(variants[0].hparams, traced)
+        return smallest_with_room(shapes, values), hparams, values
 
     spec = agent.spec
     if len(variants) > 1:  # under vmap all branches would run

@@ -1,10 +1,9 @@
 """A task: a real environment that agents are tested on, and its spec."""
 
-import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -74,7 +73,7 @@ class Task(TaskSpec):
         fix = "Set env.solved_reward=inf if it is undefined"
         must = f"must be a number; got {options.shortened(solved_reward)}. {fix}."
         options.require(is_known, "env.solved_reward", must)
-        with _one_error(name):
+        try:
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = options.as_python(limit)
@@ -86,6 +85,14 @@ class Task(TaskSpec):
             observation, action = spaces_of(vectors, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # seconds for some, which have their own tests
+        except options.ConfigError:
+            raise
+        except Exception as error:  # whatever an environment raises
+            results = "obs, state, reward, terminated and info"
+            fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
+            raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
+            message = f"env must be a gymnax 1.x environment with EnvParams; {raised}"
+            raise options.ConfigError(message, "env") from error
         known = {"env": vectors, "params": params, "max_steps": int(max_steps)}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)
@@ -111,21 +118,6 @@ def require_own_steps(env: Environment) -> None:
     fix = f"got {type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper"
     must = f"must change reset_env and step_env in place of reset and step; {fix}."
     options.require(is_whole, "env", must)
-
-
-@contextlib.contextmanager
-def _one_error(name: str) -> Iterator[None]:
-    """Turns whatever an environment raises within into a `ConfigError`."""
-    try:
-        yield
-    except options.ConfigError:
-        raise
-    except Exception as error:
-        results = "obs, state, reward, terminated and info"
-        fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
-        raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
-        message = f"env must be a gymnax 1.x environment with EnvParams; {raised}"
-        raise options.ConfigError(message, "env") from error
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:

@@ -3,7 +3,6 @@
 Source: `docs/reference.md` 6.1 and 6.2.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -99,13 +98,10 @@ class GridWorld(Environment[GridState, GridParams]):
 
 def _next_indices(cells: np.ndarray) -> np.ndarray:
     """Index reached from each cell by each action, `[num_states, 4]` int32."""
-    padded = np.pad(cells, 1, constant_values="#")
     index = np.arange(cells.size).reshape(cells.shape)
-    columns = []
-    for down, right in MOVES:
-        target = np.roll(padded, (-down, -right), (0, 1))[1:-1, 1:-1]
-        moved = index + down * cells.shape[1] + right
-        columns.append(np.where(target == "#", index, moved).ravel())
+    padded = np.pad(np.where(cells == "#", -1, index), 1, constant_values=-1)  # -1: a wall
+    targets = [np.roll(padded, (-down, -right), (0, 1))[1:-1, 1:-1] for down, right in MOVES]
+    columns = [np.where(target < 0, index, target).ravel() for target in targets]
     return np.stack(columns, axis=1).astype(np.int32)
 
 
@@ -128,8 +124,8 @@ class CliffWalking(Options):
     goal_reward: float = option(0.0, finite("it is a reward"))
 
     def make(self) -> Task:
-        rewards = GridParams(step_reward=-1.0, goal_reward=self.goal_reward, hole_reward=-100.0)
-        params = dataclasses.replace(rewards, max_steps_in_episode=self.spec.max_steps)
+        rewards = {"step_reward": -1.0, "goal_reward": self.goal_reward, "hole_reward": -100.0}
+        params = GridParams(**rewards, max_steps_in_episode=self.spec.max_steps)
         return Task.of(self.spec, name="cliff_walking", env=GridWorld(CLIFF_WALKING, params))
 
 

@@ -61,6 +61,4 @@ class GymnaxTask(Options):
         if solved is None:
             solved = SOLVED_REWARD.get(gymnax_id, math.inf)
         max_steps = self.max_steps or params.max_steps_in_episode
-        return Task(
-            name=self.name, env=env, params=params, solved_reward=solved, max_steps=max_steps
-        )
+        return Task(name=self.name, env=env, solved_reward=solved, max_steps=max_steps)

@@ -147,8 +147,5 @@ def _space_of(plain: Mapping[str, Any]) -> Space:
     """Inverse of `_plain`."""
     if "n" in plain:
         return Discrete(plain["n"])
-    low, high = (
-        tuple(end if x is None else float(x) for x in plain[name])
-        for name, end in (("low", -math.inf), ("high", math.inf))
-    )
-    return Box(low, high)
+    bounds = (plain["low"], -math.inf), (plain["high"], math.inf)
+    return Box(*(tuple(end if x is None else float(x) for x in bound) for bound, end in bounds))

@@ -1,8 +1,7 @@
 """Environments around another one: actions repeated, partly scored, or all as vectors."""
 
 import dataclasses
-import functools
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -81,7 +80,7 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
         return obs, state, total, terminated, {**info, "num_steps": num_steps}
 
 
-@functools.cache
+@cache
 def repeat_actions(env: Environment, num_repeats: int) -> Environment:
     """The environment in which actions last for `num_repeats` steps; itself for 1."""
     return env if num_repeats == 1 else ActionRepeat(env, num_repeats)

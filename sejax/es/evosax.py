@@ -135,9 +135,7 @@ def from_evosax(
     )
 
 
-def finite_fitness(
-    fitness: Float[Array, " pop"], of_none: Array | float = 0.0
-) -> Float[Array, " pop"]:
+def finite_fitness(fitness: Float[Array, " pop"], of_none: float) -> Float[Array, " pop"]:
     """Fitness (minimised) with entries that are not finite just worse than the worst finite one.
 
     An infinity would poison the algorithms that standardise, so the gap is that between best and

@@ -51,8 +51,66 @@ class NESConfig(StrategyOptions):
     weight_decay: float = option(0.0, fraction())
 
     def make(self, num_dims: int) -> Strategy:
-        """NES over vectors of `num_dims` numbers."""
-        return make_nes(self, num_dims)
+        r"""NES over vectors `[num_dims]`.
+
+        The population is psi + eps_i for each of `population_size`, then psi - eps_i if sampling is
+        mirrored. A mirrored pair's score is that of its better sign, and its eps has that sign; a
+        tie keeps the plus.
+
+        .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
+
+        with the weights F of the score transform, divided by :math:`n_p \sigma` with
+        `update_rule="paper"`.
+
+        Source: paper, Algorithm 1; `docs/reference.md` 2.
+
+        Example:
+          >>> strategy = NESConfig(population_size=4).make(num_dims=3)
+          >>> state = strategy.init(jax.random.key(0), jnp.zeros(3))
+          >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps and -eps
+          (8, 3)
+        """
+        num_noises = self.population_size
+        transform = transform_of(self.score_transform, num_noises)
+
+        def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
+            return NESState(
+                mean=mean,
+                noise_std=jnp.float32(self.noise_std),
+                step_size=jnp.float32(self.step_size),
+            )
+
+        def ask(key: Array, state: NESState) -> tuple[Float[Array, "pop dims"], NESState]:
+            noise = state.noise_std * jax.random.normal(key, (num_noises, num_dims))
+            signed = jnp.concatenate([noise, -noise]) if self.mirrored else noise
+            return state.mean + signed, state
+
+        def tell(
+            key: Array, population: Array, scores: Array, incumbent_score: Array, state: NESState
+        ) -> NESState:
+            noise = population - state.mean
+            if self.mirrored:
+                scores, noise = better_signs(scores, noise)
+            weights = transform(scores, incumbent_score)
+            step = state.step_size * weights @ noise
+            if self.update_rule == "paper":
+                step = step / (num_noises * state.noise_std)
+            return dataclasses.replace(
+                state,
+                mean=(1 - self.weight_decay) * state.mean + step,
+                noise_std=state.noise_std * self.noise_std_decay,
+                step_size=state.step_size * self.step_size_decay,
+            )
+
+        return Strategy(
+            init=init,
+            ask=ask,
+            tell=tell,
+            incumbent=lambda state: state.mean,
+            population_size=2 * num_noises if self.mirrored else num_noises,
+            antithetic=self.mirrored,
+            evaluations=self.evaluations(self.num_incumbent_evals or num_noises),
+        )
 
 
 @struct.dataclass
@@ -60,69 +118,6 @@ class NESState:
     mean: Float[Array, " dims"]  # psi
     noise_std: Array  # sigma
     step_size: Array  # alpha
-
-
-def make_nes(config: NESConfig, num_dims: int) -> Strategy:
-    r"""Builds NES over vectors `[num_dims]`.
-
-    The population is psi + eps_i for each of `config.population_size`, then psi - eps_i if
-    sampling is mirrored. A mirrored pair's score is that of its better sign, and its eps has that
-    sign; a tie keeps the plus.
-
-    .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
-
-    with the weights F of the score transform, divided by :math:`n_p \sigma` with
-    `update_rule="paper"`.
-
-    Source: paper, Algorithm 1; `docs/reference.md` 2.
-
-    Example:
-      >>> strategy = make_nes(NESConfig(population_size=4), num_dims=3)
-      >>> state = strategy.init(jax.random.key(0), jnp.zeros(3))
-      >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps and -eps
-      (8, 3)
-    """
-    num_noises = config.population_size
-    transform = transform_of(config.score_transform, num_noises)
-
-    def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
-        return NESState(
-            mean=mean,
-            noise_std=jnp.float32(config.noise_std),
-            step_size=jnp.float32(config.step_size),
-        )
-
-    def ask(key: Array, state: NESState) -> tuple[Float[Array, "pop dims"], NESState]:
-        noise = state.noise_std * jax.random.normal(key, (num_noises, num_dims))
-        signed = jnp.concatenate([noise, -noise]) if config.mirrored else noise
-        return state.mean + signed, state
-
-    def tell(
-        key: Array, population: Array, scores: Array, incumbent_score: Array, state: NESState
-    ) -> NESState:
-        noise = population - state.mean
-        if config.mirrored:
-            scores, noise = better_signs(scores, noise)
-        weights = transform(scores, incumbent_score)
-        step = state.step_size * weights @ noise
-        if config.update_rule == "paper":
-            step = step / (num_noises * state.noise_std)
-        return dataclasses.replace(
-            state,
-            mean=(1 - config.weight_decay) * state.mean + step,
-            noise_std=state.noise_std * config.noise_std_decay,
-            step_size=state.step_size * config.step_size_decay,
-        )
-
-    return Strategy(
-        init=init,
-        ask=ask,
-        tell=tell,
-        incumbent=lambda state: state.mean,
-        population_size=2 * num_noises if config.mirrored else num_noises,
-        antithetic=config.mirrored,
-        evaluations=config.evaluations(config.num_incumbent_evals or num_noises),
-    )
 
 
 def better_signs(

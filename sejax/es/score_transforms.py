@@ -98,9 +98,7 @@ _BY_ADVANTAGE = (single_best, single_better, all_better_1, all_better_2)
 TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY_ADVANTAGE)}
 
 
-def require_transform(
-    field: str, choice: str | OwnTransform, default: str | OwnTransform | None = None
-) -> None:
+def require_transform(field: str, choice: str | OwnTransform, default: object) -> None:
     """Checks that it is a name, a `module:attribute` that may be imported, or a function.
 
     Raises:

@@ -8,8 +8,6 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import filelock
-
 from sejax.options import ConfigError, shortened
 
 
@@ -31,60 +29,24 @@ def require_writable(field: str, folder: Path) -> None:
     Raises:
       ConfigError: of this field, if they cannot.
     """
-    new_folders = _missing(folder)
+    new_folders = missing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        _remove_empty(new_folders)
+        remove_empty(new_folders)
     except (OSError, ValueError) as error:
         message = f"{field} must be a folder that can be written; got {shortened(error)}."
         raise ConfigError(f"{message} Set {field}=FOLDER.", field) from error
 
 
-class FolderLock:
-    """A folder that this process alone uses until `release`."""
-
-    NAME = "sejax.lock"
-
-    def __init__(self, folder: Path, hint: str, field: str = "run_dir"):
-        """Makes the folder and locks it; the lock ends with the process, however that ends.
-
-        Args:
-          folder: the folder.
-          hint: last sentence of messages: how to choose another folder.
-          field: the field that names the folder.
-
-        Raises:
-          ConfigError: if another process uses it, or it cannot be written.
-        """
-        self._folder, self._new_folders = folder, _missing(folder)
-        self._lock = filelock.FileLock(folder / self.NAME, timeout=0, thread_local=False)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._lock.acquire()
-        except (OSError, ValueError, NotImplementedError) as error:
-            is_used = isinstance(error, filelock.Timeout)
-            why = "which another process uses" if is_used else shortened(error)
-            message = (
-                f"{field} must be a folder that can be written; got {shortened(folder)}, {why}."
-            )
-            raise ConfigError(f"{message} {hint}", field) from error
-
-    def release(self, is_used: bool) -> None:
-        """Lets other processes use the folder; leaves nothing behind unless `is_used`."""
-        if self._lock.is_locked and not is_used:
-            (self._folder / self.NAME).unlink(missing_ok=True)
-            _remove_empty(self._new_folders)
-        self._lock.release()
-
-
-def _missing(folder: Path) -> list[Path]:
+def missing(folder: Path) -> list[Path]:
     """A folder and those above it that are not there, the innermost first."""
     return [path for path in (folder, *folder.parents) if not os.path.exists(path)]
 
 
-def _remove_empty(folders: Iterable[Path]) -> None:
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Removes those of the folders that are empty."""
     for folder in folders:
         with contextlib.suppress(OSError):  # it is not empty
             folder.rmdir()

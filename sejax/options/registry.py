@@ -14,7 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.runs.trackers.Tracker`
-`machines`    `sejax.machines`        `(config, say)`: see `sejax.runs.workers`
+`machines`    `sejax.machines`        `(config)`: see `sejax.runs.workers`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -77,7 +77,7 @@ GROUPS = {
     "objective": Group("sejax.objectives", "sejax.objectives:Objective", ("task",)),
     "es": Group("sejax.strategies", "sejax.es.base:Strategy", ("num_dims",)),
     "tracker": Group("sejax.trackers", "sejax.runs.trackers:Tracker", ("run",)),
-    "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config", "say")),
+    "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config",)),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
 # Names that come with sejax.

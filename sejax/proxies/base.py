@@ -149,9 +149,7 @@ class ProxyEnv(Environment, ABC):
         """Random weights, or those given to `with_default_params`."""
         return self._default_params or self.params(self.init_weights(jax.random.key(0)))
 
-    def with_default_params(
-        self, params: PyTree, learned_config: Mapping[str, Any] | None = None
-    ) -> "ProxyEnv":
+    def with_default_params(self, params: PyTree, learned_config: Mapping[str, Any]) -> "ProxyEnv":
         """A copy for callers that rely on `default_params`, such as `gymnax.make`.
 
         Args:

@@ -487,16 +487,11 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
     is_its_task = learned.task == real.name
     require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
     if task is not None:
-        _require_same(learned, task, proxy, where)
+        limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
+        wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))
+        must = f"must have spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
+        require(learned.interface | limit == task.interface, "task", must)
     return registry.make("proxy", proxy, real)
-
-
-def _require_same(learned: Header, task: Task, proxy: ProxyConfig, where: str) -> None:
-    """Checks that a task given is that of the proxy: spaces and, for an SE, the step limit."""
-    limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
-    wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))
-    must = f"must have the spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
-    require(learned.interface | limit == task.interface, "task", must)
 
 
 # --- a task that cannot be made here --------------------------------------------------------------

@@ -256,7 +256,7 @@ class RewardEnv(ProxyEnv):
         at_limit = state.time >= params.max_steps_in_episode
         return at_limit | self.task.env.is_truncated(state.world, self.task.params)
 
-    def get_obs(self, state: RewardState, params: PyTree = None, key: Array | None = None) -> Array:
+    def observe(self, state: RewardState) -> Array:
         return state.obs
 
 

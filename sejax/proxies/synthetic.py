@@ -253,7 +253,7 @@ class SyntheticEnv(ProxyEnv):
             # At the limit, and not beyond it: the first step from there ends the episode.
             vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
-        return self.get_obs(state), state
+        return self.observe(state), state
 
     def step_env(
         self, key: Array, state: SyntheticState, action: Array, params: ProxyParams
@@ -277,7 +277,7 @@ class SyntheticEnv(ProxyEnv):
             "discount": jnp.where(is_sane & jnp.logical_not(at_horizon), discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),
         }
-        return self.get_obs(state), state, jnp.where(is_sane, reward, 0.0), terminated, info
+        return self.observe(state), state, jnp.where(is_sane, reward, 0.0), terminated, info
 
     def ends(self, key: Array, done: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the done output ends the episode."""
@@ -291,9 +291,7 @@ class SyntheticEnv(ProxyEnv):
             return jnp.bool_(False)
         return super().is_truncated(state, params)
 
-    def get_obs(
-        self, state: SyntheticState, params: PyTree = None, key: Array | None = None
-    ) -> Array:
+    def observe(self, state: SyntheticState) -> Array:
         if self.task.num_states is not None:
             return jnp.argmax(state.vector).astype(jnp.int32)
         return state.vector

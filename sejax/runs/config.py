@@ -121,22 +121,17 @@ class CommandConfig(Options):
         Raises:
           ConfigError: if it does not.
         """
-        longest, steps, got = (
-            proxy.max_steps(spec.max_steps),
-            training.max_steps,
-            training.solved_by,
-        )
+        longest, got = proxy.max_steps(spec.max_steps), training.solved_by
         require_reachable(group, training, longest)
         field = f"{group}.solved_by"
         message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
         require(training.stop_rule != "solved" or got == "test", field, message)
         before = self.agents[key].steps_before_learning(longest, spec.max_steps)
-        message = (
-            f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
-        )
+        steps = training.max_steps
+        must = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
         is_enough = not proxy.reaches_step_limit or steps is None or steps > before
         field = f"{group}.max_steps"
-        require(is_enough, field, f"{message} Set {field}={4 * before}.")
+        require(is_enough, field, f"{must} Set {field}={4 * before}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ changes nothing.
 
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import jax
 import numpy as np
@@ -80,19 +80,20 @@ class RunDirectory(Store):
         self.columns = (*COLUMNS, *of_agents)
         self._tensors: dict[str, np.ndarray] | None = None
 
-    def lock(self) -> None:
+    def __enter__(self) -> Self:
         """Takes the folder, and reads what the checkpoint holds, if there is one.
 
         Raises:
           ConfigError: if the folder holds another run or a damaged one, is in use by another
             process, or cannot be written.
         """
-        super().lock()
+        super().__enter__()
         try:
             self._open()
         except BaseException:
-            self.release()
+            self.__exit__()
             raise
+        return self
 
     @property
     def finished_generations(self) -> int:
@@ -144,7 +145,8 @@ class RunDirectory(Store):
         """
         new = self._rows_of(info, wall_s)
         csv, is_first = self._as_csv([*self.rows, *new]), not self.rows
-        tensors = as_tensors(state) | {_ROWS: np.frombuffer(csv.encode(), np.uint8)}
+        tensors = jax.device_get(_bare(_named(state)))  # all at once
+        tensors[_ROWS] = np.frombuffer(csv.encode(), np.uint8)
         versions = runtime.versions()
         self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=versions)
         self.rows, self.cpu_s = [*self.rows, *new], cpu_s
@@ -214,14 +216,8 @@ def _as_text(value: np.generic) -> str:
 # --- pytrees as tensors by name -------------------------------------------------------------------
 
 
-def as_tensors(state: PyTree[Array]) -> dict[str, np.ndarray]:
-    """The leaves of a pytree by their paths, as arrays that safetensors can store."""
-    arrays: dict[str, np.ndarray] = jax.device_get(_bare(_named(state)))  # all at once
-    return arrays
-
-
 def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
-    """The inverse of `as_tensors`; leaves of their own memory, tied to no device.
+    """A pytree of stored leaves, each of its own memory and tied to no device.
 
     Args:
       tensors: leaves by path.

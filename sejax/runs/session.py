@@ -50,7 +50,7 @@ def run(
     report, learner = report or Reporter(), chunks.learner
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
-    state = _begin(config, directory, chunks, report)
+    state = _begin(config.seed, directory, chunks, report)
     drawn = time.monotonic()
     folder, first = directory.path.resolve(), directory.finished_generations
     tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
@@ -93,11 +93,9 @@ def run(
     return summary
 
 
-def _begin(
-    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter
-) -> LearnState:
+def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: Reporter) -> LearnState:
     """A new state or that of the folder, beside which the proxies are written again."""
-    state = chunks.init(jax.random.key(config.seed))
+    state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
     if restored is not None:
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")

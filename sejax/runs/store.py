@@ -10,15 +10,17 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
+import filelock
 import numpy as np
 
 from sejax.ops import checksummed
-from sejax.ops.files import FolderLock, write_bytes
-from sejax.options import ConfigError
+from sejax.ops.files import missing, remove_empty, write_bytes
+from sejax.options import ConfigError, shortened
 from sejax.options.plain import differences
 
 Tensors: TypeAlias = Mapping[str, np.ndarray]  # by name
 KIND, FORMAT_VERSION = "sejax_run", 1  # of the files, since the first release
+LOCK = "sejax.lock"  # the file that says that a process uses the folder
 
 
 class Store:
@@ -59,28 +61,32 @@ class Store:
         self.settings: dict[str, Any] = json.loads(json.dumps(settings))
         self._field, self._hint = field, f"Set {field}=FOLDER."
         self._free, self._completed = free, completed
-        self._lock: FolderLock | None = None
+        self._lock = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
         self._is_used = False
 
     def __enter__(self) -> Self:
-        self.lock()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
-
-    def lock(self) -> None:
-        """Makes the folder, and keeps other processes out of it until `release`.
+        """Makes the folder and locks it; the lock ends with the process, however that ends.
 
         Raises:
           ConfigError: if another process uses it, or it cannot be written.
         """
-        self._lock = FolderLock(self.folder, self._hint, self._field)
+        self._new_folders = missing(self.folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+        except (OSError, ValueError, NotImplementedError) as error:
+            is_used = isinstance(error, filelock.Timeout)
+            why = "which another process uses" if is_used else shortened(error)
+            must = "must be a folder that can be written"
+            raise self.refused(f"{must}; got {shortened(self.folder)}, {why}") from error
+        return self
 
-    def release(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Lets other processes use the folder; leaves nothing behind if it has no entry."""
-        if self._lock is not None:
-            self._lock.release(self._is_used)
+        if self._lock.is_locked and not self._is_used:
+            (self.folder / LOCK).unlink(missing_ok=True)
+            remove_empty(self._new_folders)
+        self._lock.release()
 
     def file(self, name: str) -> Path:
         """The file of an entry."""
@@ -122,7 +128,7 @@ class Store:
           OSError: if it cannot be written, or the folder was removed since it was locked; the entry
             before is then whole.
         """
-        if self._lock is not None and not (self.folder / FolderLock.NAME).exists():
+        if self._lock.is_locked and not (self.folder / LOCK).exists():
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
         manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
         write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest))

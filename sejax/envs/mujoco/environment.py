@@ -104,10 +104,8 @@ class MujocoTask(Options):
         """Whether the episode can go on, for tasks that terminate."""
         return jnp.bool_(True)
 
-    def rewards(
-        self, now: "Report", action: Float[Array, " nu"], healthy: Bool[Array, ""]
-    ) -> Scalars:
-        """The parts of the reward, by Gymnasium's names."""
+    def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
+        """The parts of the reward, by Gymnasium's names; actions are `[nu]`, `healthy` is `[]`."""
         raise NotImplementedError
 
     def more_info(self, now: "Report") -> Scalars:

@@ -2,15 +2,17 @@
 
 import functools
 import hashlib
+import math
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from sejax.envs.mujoco import library
@@ -65,14 +67,11 @@ class Physics:
         handlers.SejaxMujocoRegister(self._id, self.model._address)
         self.num_words = 2 * handlers.SejaxMujocoLength(self.model._address)
         nq, nv, nbody = self.model.nq, self.model.nv, self.model.nbody
-        self._shapes = {
-            "qpos": (nq,),
-            "qvel": (nv,),
-            "qpos_change": (nq,),
-            "xpos": (nbody, 3),
-            "xpos_change": (nbody, 3),
-            "cfrc_ext": (nbody if with_forces else 0, 6),
-        }  # as step.cc reports them, one after the other
+        # As step.cc reports them, one after the other.
+        shapes = (nq,), (nv,), (nq,), (nbody, 3), (nbody, 3), (nbody if with_forces else 0, 6)
+        self._num_reported = sum(map(math.prod, shapes))
+        zeros: list[Any] = [np.zeros(shape, np.float32) for shape in shapes]
+        _, self._report_of = ravel_pytree(Report(*zeros))
 
     @property
     def dt(self) -> float:
@@ -98,15 +97,13 @@ class Physics:
         return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))
 
     def _call(self, target: str, *arguments: Array, **attributes: np.int64) -> tuple[Array, Report]:
-        sizes = [int(np.prod(shape)) for shape in self._shapes.values()]
         results = (
             jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
-            jax.ShapeDtypeStruct((sum(sizes),), jnp.float32),
+            jax.ShapeDtypeStruct((self._num_reported,), jnp.float32),
         )
         call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
         state, numbers = call(*arguments, model=self._id, **attributes)
-        parts = zip(self._shapes.items(), jnp.split(numbers, np.cumsum(sizes)[:-1]), strict=True)
-        return state, Report(**{name: x.reshape(shape) for (name, shape), x in parts})
+        return state, self._report_of(numbers)
 
 
 @functools.cache

@@ -301,7 +301,6 @@ def _forces(now: "Report") -> Float[Array, "nbody 6"]:
 
 
 _RADIUS = 0.2  # m, of the disc that the target is in
-_PENALTIES = ("reward_dist", "reward_ctrl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,7 +317,7 @@ class Reacher(MujocoTask):
     file = "reacher.xml"
     frame_skip = 2
     spec = dataclasses.replace(
-        _spec(10, 2, solved_reward=-3.75, info_keys=_PENALTIES), max_steps=50
+        _spec(10, 2, solved_reward=-3.75, info_keys=("reward_dist", "reward_ctrl")), max_steps=50
     )
 
     reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
