@@ -92,6 +92,7 @@ def test_sigterm_is_heard_as_ctrl_c_is(monkeypatch, capsys):
     monkeypatch.setattr(commands, "leave", left.append)
     monkeypatch.setattr(threading, "Timer", lambda *call: again.append(call) or MagicMock())
     before = signal.getsignal(signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
     for number in (signal.SIGTERM, signal.SIGINT):
         main = functools.partial(commands.start, lambda _, x=number: signal.raise_signal(x), str)
         said.append(ended(monkeypatch, capsys, main)[1])
