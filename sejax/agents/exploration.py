@@ -164,9 +164,8 @@ def with_icm(
 
     Before each learning step on `Transition`s the module takes one step of Adam on the batch; then
     its bonus for that batch, by the models as updated, is added to the rewards that the agent sees.
-    On a `Rollout`, where it is full, the bonus comes first and the module's one step after it; the
-    agent inside must leave its state as it is at all other times. The buffer keeps rewards without
-    the bonus, which is computed anew whenever a step is learned from.
+    On a `Rollout` the bonus comes first and the module's one step after it. The buffer keeps
+    rewards without the bonus, which is computed anew whenever a step is learned from.
 
     Args:
       agent: one that learns from batches of `Transition`s, or from a `Rollout`.
