@@ -27,7 +27,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest import mock
 
 import common
 import jax
@@ -163,9 +162,8 @@ def kernels(name: str, args: argparse.Namespace) -> dict[str, Any]:
 
     They are those of the largest loop of the program; a loop within it counts once.
     """
-    with mock.patch("sejax.ops.parallel.on_cpu", lambda: False):  # the program of a GPU
-        train, keys, params = training_of(name, 64, 8 if args.quick else STEPS)
-        traced = jax.jit(jax.vmap(train, (0, None))).trace(keys, params)
+    train, keys, params = training_of(name, 64, 8 if args.quick else STEPS)
+    traced = jax.jit(jax.vmap(train, (0, None))).trace(keys, params)
     module = traced.lower(lowering_platforms=("cuda",)).compiler_ir()
     functions = {x.attributes["sym_name"].value: x for x in module.body.operations}
     loops = [count(loop, functions) for loop in loops_of(functions["main"], functions)]

@@ -12,6 +12,7 @@ from test_ppo import (
     KINDS,
     MAX_ACTION,
     STEPS,
+    networks,
     ppo,
     random_steps,
 )
@@ -124,7 +125,7 @@ class TorchPPO:
 def initial(kind):
     agent = ppo(kind)
     params = agent.init(jax.random.key(1), agent.hparams).params
-    return TorchPPO(kind, params)
+    return TorchPPO(kind, networks(kind)[2](params))
 
 
 if __name__ == "__main__":
