@@ -27,6 +27,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import common
 import jax
@@ -162,8 +163,9 @@ def kernels(name: str, args: argparse.Namespace) -> dict[str, Any]:
 
     They are those of the largest loop of the program; a loop within it counts once.
     """
-    train, keys, params = training_of(name, 64, 8 if args.quick else STEPS)
-    traced = jax.jit(jax.vmap(train, (0, None))).trace(keys, params)
+    with mock.patch("sejax.ops.parallel.on_cpu", lambda: False):  # the program of a GPU
+        train, keys, params = training_of(name, 64, 8 if args.quick else STEPS)
+        traced = jax.jit(jax.vmap(train, (0, None))).trace(keys, params)
     module = traced.lower(lowering_platforms=("cuda",)).compiler_ir()
     functions = {x.attributes["sym_name"].value: x for x in module.body.operations}
     loops = [count(loop, functions) for loop in loops_of(functions["main"], functions)]

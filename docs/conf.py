@@ -72,11 +72,7 @@ nitpick_ignore_regex = [
         "py:class",
         r"sejax\.(agents\.(base\.T|buffers\.State)|es\.base\.T|proxies\.synthetic\.Vector|envs\.environment\.(State|Params))",
     ),
-    (
-        "py:class",
-        r"sejax\.(options\.(T|registry\.T|parts\.(Makes|RunConfig))|scoring\.Scoring|evaluation\.Tests"
-        r"|ops\.networks\.MLP)",
-    ),
+    ("py:class", r"sejax\.(options\.parts\.(Makes|RunConfig)|scoring\.Scoring|ops\.networks\.MLP)"),
 ]
 
 # --- HTML ----------------------------------------------------------------------------------------

@@ -35,7 +35,10 @@ from .objectives import (
     Outcome as Outcome,
     RewardThreshold as RewardThreshold,
 )
-from .ops.parallel import spread_over_devices as spread_over_devices
+from .ops.parallel import (
+    compiler_options as compiler_options,
+    spread_over_devices as spread_over_devices,
+)
 from .options import ConfigError as ConfigError
 from .proxies import ProxyConfig as ProxyConfig
 from .proxies.base import ProxyEnv as ProxyEnv, ProxyParams as ProxyParams

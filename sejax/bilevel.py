@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent
@@ -24,7 +25,6 @@ from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
 from sejax.generation import Candidates, GenerationEvaluator
 from sejax.objectives import MaxReward, Objective, Outcome
-from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_lowest
 from sejax.options import counts, require
@@ -87,7 +87,7 @@ class Bilevel:
     def init(self, key: Array) -> LearnState:
         """The state before the first generation, with random weights of the proxy."""
         key_weights, key_es, key_run = jax.random.split(key, 3)
-        mean = flat.flatten(self.proxy.init_weights(key_weights))
+        mean, _ = ravel_pytree(self.proxy.init_weights(key_weights))
         unknown = jnp.full(self.scoring.mixture.size, -jnp.inf)
         state = LearnState(
             key=key_run,
@@ -243,7 +243,7 @@ def make_bilevel(
     objective = make_part("objective", Objective, objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
-    unravel = flat.inverse_of_flatten(shapes)
+    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
     strategy = make_part("es", Strategy, es, num_dims)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(

@@ -22,11 +22,11 @@ from sejax.objectives import Outcome
 from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.ops.parallel import compiler_options, in_batches_on_cpu, spread_over_devices
 from sejax.options import LARGEST, require
 from sejax.options.parts import require_part
 from sejax.proxies.base import ProxyEnv, is_real
-from sejax.training import TrainingConfig, TrainResult, make_trainer
+from sejax.training import TrainingConfig, TrainResult, make_trainer, num_parallel_on_cpu
 
 # --- greedy episodes ------------------------------------------------------------------------------
 
@@ -253,9 +253,9 @@ def make_evaluator(
 
         return run
 
-    run = agent.fresh(make_run)
+    run = in_batches_on_cpu(agent.fresh(make_run), num_parallel_on_cpu(agent, training))
     return lambda key, env_params, active=True, test_params=None: run(
-        key, env_params, active, test_params
+        key, env_params, jnp.asarray(active), test_params
     )
 
 
@@ -310,12 +310,6 @@ def area_under_curve(result: TrainResult, final_return: Array) -> Array:
 
 
 # --- many fresh agents ----------------------------------------------------------------------------
-
-
-def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
-    """Agents in a vmapped batch on a CPU core; 1 where all would wait for the longest training."""
-    num_parallel = agent.spec.cpu_num_parallel
-    return num_parallel if num_parallel is None or training.is_fixed_length else 1
 
 
 def evaluate_agents(

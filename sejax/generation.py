@@ -13,12 +13,12 @@ from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent
 from sejax.es.base import Groups, StrategyState
-from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
+from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import Outcome
 from sejax.ops.parallel import spread_groups_over_devices
 from sejax.proxies.base import ProxyEnv
 from sejax.scoring import Scoring
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, num_parallel_on_cpu
 
 
 @struct.dataclass

@@ -5,8 +5,9 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -20,7 +21,8 @@ from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
-from sejax.ops.loops import while_any_active
+from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
+from sejax.ops.parallel import in_batches_on_cpu
 from sejax.options import (
     LARGEST,
     Options,
@@ -251,7 +253,17 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    return _Loop(agent, env, training, solved_reward, test_fn, recorder).train
+    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
+    train = in_batches_on_cpu(loop.train, num_parallel_on_cpu(agent, training))
+    return lambda key, env_params, hparams=None, active=True: train(
+        key, env_params, agent.hparams if hparams is None else hparams, jnp.asarray(active)
+    )
+
+
+def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+    """Agents in a vmapped batch of a CPU core; None for all, 1 if they may stop at any time."""
+    num_parallel = agent.spec.cpu_num_parallel
+    return num_parallel if num_parallel is None or training.is_fixed_length else 1
 
 
 class _Loop:
@@ -281,15 +293,8 @@ class _Loop:
             )
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
 
-    def train(
-        self,
-        key: Array,
-        env_params: PyTree,
-        hparams: Hparams | None = None,
-        active: Array | bool = True,
-    ) -> TrainResult:
-        """One training; `hparams` None are the agent's own."""
-        hparams = self.agent.hparams if hparams is None else hparams
+    def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
+        """One training."""
         env_params = self.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = self.begin(key_begin, env_params, hparams, active)
@@ -299,8 +304,12 @@ class _Loop:
         curve = {"returns": no_returns, "episode_ends": jnp.zeros(max_episodes, jnp.int32)}
         if self.test_fn is not None:
             curve["test_returns"] = no_returns
+        learns_every = self.buffers(state)[0].learns_every
+        body, per_check = self.step, STEPS_PER_CHECK
+        if learns_every > 1:
+            body, per_check = partial(self.rollout, learns_every), 1
         (stored, curve), state = while_any_active(
-            self.step, (stored, curve), state, (key_steps, env_params)
+            body, (stored, curve), state, (key_steps, env_params), per_check
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -344,13 +353,51 @@ class _Loop:
         shapes = jax.eval_shape(example)
         return [make(shapes, self.buffer_steps) for make in self.buffer_makers]
 
+    def rollout(
+        self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+    ) -> tuple[PyTree, _LoopState]:
+        """So many steps, or fewer where the training ends, and what is learned from all of them."""
+
+        def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
+            large, state = carry
+            large, stepped = self.step(large, state, consts, masked=True, learns=False)
+            return large, jax.tree.map(partial(jnp.where, state.active), stepped, state)
+
+        num_steps = state.step
+        large, state = jax.lax.fori_loop(0, length, step, (large, state))
+        (stored, _), (key, _) = large, consts
+        last = dataclasses.replace(state, step=state.step - 1)
+        agent_state = jax.lax.cond(
+            (state.step == num_steps + length) & (state.episode >= self.agent.spec.learns_from),
+            partial(self.learn, stored[0], None, last, step_keys(key, last.step, 6)),
+            lambda agent_state: agent_state,
+            state.agent_state,
+        )
+        return large, dataclasses.replace(state, agent_state=agent_state)
+
+    def learn(
+        self,
+        arrays: PyTree,
+        transition: Transition | None,
+        state: _LoopState,
+        keys: Sequence[Array],
+        agent_state: AgentState,
+    ) -> AgentState:
+        """One update, after a step that made the transition."""
+        _, _, key_sample, key_update, *_ = keys
+        size = self.agent.batch_size(agent_state)
+        buffer, *_ = self.buffers(state)
+        batch = buffer.batch(key_sample, arrays, state.step + 1, transition, size)
+        return self.agent.update(key_update, agent_state, batch)
+
     def step(
-        self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+        self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool, learns: bool = True
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (stored, curve), (key, env_params) = large, consts
         buffers = self.buffers(state)
-        key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
+        keys = step_keys(key, state.step, 6)
+        key_act, key_env, _, _, *keys_end = keys
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
             key_env, state.env_state, self.agent.env_action(action), env_params
@@ -369,15 +416,14 @@ class _Loop:
             for buffer, arrays in zip(buffers, stored, strict=True)
         )
 
-        def learn(agent_state: AgentState) -> AgentState:
-            size = self.agent.batch_size(agent_state)
-            batch = buffers[0].batch(key_sample, stored[0], state.step + 1, transition, size)
-            batch = buffers[0].mask(batch, active) if masked else batch
-            return self.agent.update(key_update, agent_state, batch)
-
-        agent_state = jax.lax.cond(
-            state.episode >= self.agent.spec.learns_from, learn, lambda s: s, state.agent_state
-        )
+        agent_state = state.agent_state
+        if learns:
+            agent_state = jax.lax.cond(
+                state.episode >= self.agent.spec.learns_from,
+                partial(self.learn, stored[0], transition, state, keys),
+                lambda agent_state: agent_state,
+                agent_state,
+            )
         train_steps = state.train_steps + info.get("num_steps", 1)
         state = dataclasses.replace(
             state,
@@ -388,7 +434,7 @@ class _Loop:
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=nonfinite,
-            active=train_steps < self.max_steps,
+            active=state.active & (train_steps < self.max_steps),
         )
         before = state
         state = jax.lax.cond(

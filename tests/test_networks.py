@@ -92,7 +92,10 @@ def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
     assert slope.shape == () and slope == PRELU_SLOPE == 0.25
 
 
-@pytest.mark.parametrize(("num_inputs", "num_outputs"), [(3, 2), (20, 2), (3, 20), (20, 20)])
+@pytest.mark.parametrize(
+    ("num_inputs", "num_outputs"),
+    [(3, 2), (20, 2), (3, 20), (20, 20), (64, 64), (128, 128)],  # wide ones are not transposed
+)
 def test_affine_and_its_gradient_equal_the_plain_product(num_inputs, num_outputs):
     shapes = [(num_outputs, num_inputs), (num_outputs,), (num_inputs, 7), (num_outputs, 7)]
     *args, weight = random_like([np.zeros(shape) for shape in shapes], scale=1.0)

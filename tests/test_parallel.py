@@ -7,7 +7,11 @@ import pytest
 from support import assert_close, assert_equal
 
 from sejax.ops.networks import MLP
-from sejax.ops.parallel import spread_groups_over_devices, spread_over_devices
+from sejax.ops.parallel import (
+    in_batches_on_cpu,
+    spread_groups_over_devices,
+    spread_over_devices,
+)
 
 
 def work(key, x):
@@ -80,3 +84,21 @@ def test_groups_have_a_function_a_size_and_a_width_each(num_devices, num_paralle
 def test_two_devices_share_the_work():
     lowered = jax.jit(spread_over_devices(lambda x: x + 1, 2)).lower(np.ones((4, 2), np.float32))
     assert "num_partitions=2" in lowered.compile().as_text().splitlines()[0]
+
+
+@pytest.mark.parametrize("width", [1, 2, 100, None])
+def test_a_vmap_in_batches_equals_the_plain_one(width):
+    def scaled(key, x, scale, nothing):
+        return work(key, scale * x) | {"nothing": nothing}
+
+    def in_two_axes(fn):
+        inner = jax.vmap(fn, (None, 0, None, 0))
+        return jax.jit(jax.vmap(inner, (0, None, None, None)))
+
+    arguments = *inputs(0, 5), 2.0, np.zeros((5, 0))  # the scale is the same for all
+    in_batches = in_batches_on_cpu(scaled, width)
+    results, expected = (
+        jax.jit(jax.vmap(fn, (0, 0, None, 0)))(*arguments) for fn in (in_batches, scaled)
+    )
+    assert_close(results, expected, rtol=1e-6)
+    assert_close(in_two_axes(in_batches)(*arguments), in_two_axes(scaled)(*arguments), rtol=1e-6)

@@ -1,16 +1,19 @@
 """What the compiler made of the inner loop: what is large is written in place."""
 
+import dataclasses
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
 import pytest
-from support import large_ops_in_loops, paper_se, paper_training
+from support import assert_equal, large_ops_in_loops, paper_se, paper_training
 
 from sejax import envs
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.options import registry
 from sejax.proxies.reward import RewardConfig
-from sejax.training import make_trainer
+from sejax.training import TrainingConfig, make_trainer
 
 CAPACITY = 7919  # rows of the replay buffer
 MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program is nearly as long
@@ -22,6 +25,8 @@ def case():
     env = registry.make("proxy", paper_se(hidden_size=4), envs.make("cartpole"))
     network = {"hidden_size": 4, "num_layers": 1, "batch_size": 4}
     agent = DDQN(DDQNConfig(**network, warmup_episodes=1, buffer_size=CAPACITY), 4, 2).agent()
+    spec = dataclasses.replace(agent.spec, cpu_num_parallel=None)  # a vmap's agents step together
+    agent = dataclasses.replace(agent, spec=spec)
     train = make_trainer(agent, env, paper_training(max_episodes=MAX_EPISODES, window=2))
     params = env.params(env.init_weights(jax.random.key(0)))
     return train, agent, params.replace(max_steps_in_episode=jnp.int32(5))
@@ -77,6 +82,23 @@ def test_the_checker_finds_the_select_of_a_plainly_vmapped_loop():
     assert "select" in {op for op, _ in large_ops_in_loops(hlo, CAPACITY)}
     # The same loop alone writes in place: the checker does not cry wolf.
     assert_in_place(jax.jit(plain).lower(lasts[0]).compile().as_text())
+
+
+def test_vmapped_trainings_of_wide_networks_are_mapped_ones_to_the_bit():
+    task, units = envs.make("cartpole"), 24  # more than columns in a batch
+    config = DDQNConfig(num_layers=2, hidden_size=units, batch_size=16, warmup_episodes=1)
+    train = make_trainer(
+        registry.make("agent", config, task), task.env, TrainingConfig(max_steps=99)
+    )
+    keys = jax.random.split(jax.random.key(0), (2, 2))
+    in_turn = vmapped = lambda key: train(key, task.params)
+    for _ in keys.shape:
+        in_turn = functools.partial(jax.lax.map, in_turn)
+        vmapped = jax.vmap(vmapped)
+    compiled = jax.jit(vmapped).lower(keys).compile()
+    assert_equal(compiled(keys), jax.jit(in_turn)(keys))
+    large = {op for op, _ in large_ops_in_loops(compiled.as_text(), units * units)}
+    assert "dot" in large and "select" not in large  # no training waits for another
 
 
 def test_a_training_is_traced_once_for_all_values_of_its_arguments(case, once):

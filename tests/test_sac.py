@@ -8,7 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_shares, drawing, numpy_forward, random_columns, shapes_of, unraveled
+from support import (
+    assert_equal,
+    assert_shares,
+    drawing,
+    numpy_forward,
+    random_columns,
+    raveled,
+    shapes_of,
+    unraveled,
+)
 
 from sejax.agents.buffers import Transition
 from sejax.agents.sac import SAC, DiscreteSAC, LearningNoise, SACConfig, squashed_gaussian
@@ -56,15 +65,12 @@ def state_of(case):
     agent = agent_of(case)
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
     rng = np.random.default_rng(2)
-    drawn = {name: np.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES}
-    drawn["params"][-1] = np.log(0.3)  # log alpha
+    drawn = {}
+    for name in NAMES:
+        like = getattr(state, name)
+        drawn[name] = unraveled(np.float32(0.5 * rng.normal(size=raveled(like).size)), like)
+    drawn["params"] = drawn["params"]._replace(log_alpha=np.float32(np.log(0.3)))
     return state.replace(**drawn, hparams=jax.tree.map(np.float32, agent.hparams))
-
-
-def nested(case, state):
-    """A state's parameters as `Params`, and its target critics, by layer."""
-    like = jax.eval_shape(sac_of(case).unflatten, state.params)
-    return unraveled(state.params, like), unraveled(state.target_critics, like.critics)
 
 
 def case_batch(case, seed):
@@ -93,9 +99,8 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
         state = learn_of(case)(state, case_batch(case, number), case_noise(case, number))
         if number in CHECKED_UPDATES:
             for name in NAMES:
-                np.testing.assert_allclose(
-                    getattr(state, name), golden[f"{case}/{name}/{number}"], rtol=2e-5, atol=4e-6
-                )
+                got, expected = getattr(state, name), golden[f"{case}/{name}/{number}"]
+                np.testing.assert_allclose(raveled(got), expected, rtol=2e-5, atol=4e-6)
 
 
 # --- by hand -------------------------------------------------------------------------------------
@@ -120,11 +125,9 @@ def test_target_critics_start_as_copies_and_the_critics_apart():
     case = "discrete"
     agent = agent_of(case)
     fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-    critics_of = sac_of(case).critics_of
-    np.testing.assert_array_equal(fresh.target_critics, critics_of(fresh.params))
-    np.testing.assert_allclose(fresh.params[-1], np.log(0.3), rtol=1e-6)
-    pair = nested(case, fresh)[0].critics["params"]["Dense_0"]["kernel"]
-    assert not np.allclose(*pair)
+    assert_equal(fresh.target_critics, fresh.params.critics)
+    np.testing.assert_allclose(fresh.params.log_alpha, np.log(0.3), rtol=1e-6)
+    assert not np.allclose(*fresh.params.critics["params"]["Dense_0"]["kernel"])
 
 
 # --- acting --------------------------------------------------------------------------------------
@@ -139,8 +142,7 @@ def drawn_actions(case, episode):
 
 
 def actor_outputs(case):
-    actor = nested(case, state_of(case))[0].actor["params"]
-    return numpy_forward(actor, OBS, "tanh", 1)
+    return numpy_forward(state_of(case).params.actor["params"], OBS, "tanh", 1)
 
 
 def test_exploring_draws_from_the_policy_and_tests_take_its_mode():

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import drawing, numpy_forward, random_columns, raveled, shapes_of, unraveled
+from jax.flatten_util import ravel_pytree
+from support import assert_equal, drawing, numpy_forward, random_columns, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
@@ -72,7 +73,7 @@ def state_with(config, params):
     agent = agent_of(config)
     state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
     hparams = jax.tree.map(np.float32, agent.hparams)
-    return state.replace(**dict(zip(NAMES, params, strict=True)), hparams=hparams)
+    return state.replace(**params, hparams=hparams)
 
 
 @functools.cache
@@ -102,46 +103,36 @@ def case_noise(config, seed):
 
 
 def initial_params(config):
-    """Random parameters, all networks' different, so that it shows which is used where."""
+    """Random parameters by `NAMES`, all different, so that it shows which are used where."""
     # A seed with which no gradient is as small as Adam's epsilon: rounding would decide its step.
     rng = np.random.default_rng(2)
     agent = agent_of(config)
-    state = jax.eval_shape(agent.init, jax.random.key(1), agent.hparams)
-    drawn = [np.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
 
-    def flat(params):
+    def drawn(name):
+        like = getattr(state, name)
+        vector = np.float32(0.5 * rng.normal(size=vectors(name, like).shape))
+        if "critics" in name:
+            one = jax.tree.map(lambda x: x[0], like)
+            params = jax.vmap(ravel_pytree(one)[1])(vector)["params"]
+        else:
+            params = unraveled(vector, like)["params"]
         if "width" in params:  # no weight: the number of units
-            params = {**params, "width": np.float32(config.hidden_size)}
-        return raveled(params)
+            params["width"] = np.full_like(params["width"], config.hidden_size)
+        return {"params": params}
 
-    return [
-        np.stack([flat(x) for x in nested]) if isinstance(nested, list) else flat(nested)
-        for nested in nested_params(config, drawn)
-    ]
+    return {name: drawn(name) for name in NAMES}
 
 
-def nested_params(config, params):
-    """Flat parameters (as in `NAMES`) as dictionaries by layer; the critics' as lists of two."""
-
-    def nest(flat, num_inputs, num_outputs):
-        init = config.mlp(num_outputs).init
-        return unraveled(flat, shapes_of(init, jax.random.key(0), np.zeros(num_inputs)))["params"]
-
-    nest_actor = functools.partial(nest, num_inputs=OBS_DIM, num_outputs=ACTION_DIM)
-    nest_critic = functools.partial(nest, num_inputs=OBS_DIM + ACTION_DIM, num_outputs=1)
-    actor, critics, target_actor, target_critics = params
-    return (
-        nest_actor(actor),
-        [nest_critic(x) for x in critics],
-        nest_actor(target_actor),
-        [nest_critic(x) for x in target_critics],
-    )
+def vectors(name, params):
+    """Parameters of one of `NAMES` as a vector; the critics' as the rows of a matrix."""
+    lead = (2,) if "critics" in name else ()
+    return np.concatenate([np.reshape(x, (*lead, -1)) for x in jax.tree.leaves(params)], axis=-1)
 
 
 def actor_outputs(config, state, obs):
     """The actor's outputs for one observation, by plain loops; networks without layer norm."""
-    params = nested_params(config, [getattr(state, name) for name in NAMES])[0]
-    return numpy_forward(params, obs, config.activation, config.num_layers)
+    return numpy_forward(state.actor["params"], obs, config.activation, config.num_layers)
 
 
 # --- updates against torch -----------------------------------------------------------------------
@@ -156,9 +147,8 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
         state = learn_of(config)(state, case_batch(config, number), case_noise(config, number))
         if number in CHECKED_UPDATES:
             for name in NAMES:
-                np.testing.assert_allclose(
-                    getattr(state, name), golden[f"{case}/{name}/{number}"], rtol=2e-5, atol=4e-6
-                )
+                got, expected = getattr(state, name), golden[f"{case}/{name}/{number}"]
+                np.testing.assert_allclose(vectors(name, got), expected, rtol=2e-5, atol=4e-6)
 
 
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
@@ -176,9 +166,9 @@ def test_noise_is_normal_and_gumbel_and_drawn_independently():
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
 def test_targets_start_as_copies_and_the_critics_apart(config):
     state = state_of(config)
-    np.testing.assert_array_equal(state.target_actor, state.actor)
-    np.testing.assert_array_equal(state.target_critics, state.critics)
-    assert not np.allclose(*state.critics)
+    assert_equal(state.target_actor, state.actor)
+    assert_equal(state.target_critics, state.critics)
+    assert not np.allclose(*vectors("critics", state.critics))
 
 
 # --- the Gumbel-Softmax --------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from support import assert_close, assert_equal, paper_se, paper_training, refuse
 
 from sejax import envs, evaluation
 from sejax.agents import AgentSpec
-from sejax.agents.buffers import Buffer, rollout_buffer
+from sejax.agents.buffers import Buffer, Rollout, rollout_buffer
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.envs.wrappers import PartlyScored, PartParams
@@ -292,31 +292,35 @@ def test_lanes_equal_single_trainings(variant, shape):
         assert_close(lane, train(*alone), rtol=1e-4, atol=1e-4)
 
 
-def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
-    """Its last step is made again until all lanes have stopped; what it would do is left out."""
-    seen = {"tests": 0, "phases": 0}
-
-    def count(what, happens):
-        seen[what] += bool(happens)
+def test_a_rollout_is_learned_from_once_it_is_full_and_a_lane_that_has_stopped_does_nothing():
+    num_tests = []
 
     def tested(key, agent_state, active):
-        jax.debug.callback(functools.partial(count, "tests"), active)
+        jax.debug.callback(lambda happens: num_tests.append(int(happens)), active)
         return jnp.float32(0), jnp.int32(1)
 
-    def update(key, state, rollout):
-        jax.debug.callback(functools.partial(count, "phases"), rollout.is_full)
-        return state
-
+    plain = scripted_agent(warmup_episodes=0)
+    empty = plain.init(KEY, 0.0).replace(batch=Rollout(jnp.zeros((13, 8))))
     agent = dataclasses.replace(
-        scripted_agent(warmup_episodes=0), update=update, buffer=rollout_buffer(13)
+        plain,
+        init=lambda key, hparams: empty,
+        update=lambda key, state, rollout: state.replace(
+            num_updates=state.num_updates + 1, batch=rollout
+        ),
+        buffer=rollout_buffer(13),
     )
-    config = training(stop_rule="never", max_steps=24, tests_between=1)
+    config = training(stop_rule="never", max_steps=30, tests_between=1)
     train = make_trainer(agent, ENV, config, test_fn=tested)
-    params = stacked([script([1] * 12, [length] * 12) for length in (1, 2)])  # 12 steps; 24
-    result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params)
+    params = stacked([script([1] * 12, [length] * 12) for length in (1, 2, 3)])
+    result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 3), params)
     jax.effects_barrier()
-    np.testing.assert_array_equal(result.train_steps, [12, 24])
-    assert seen == {"tests": 12 + 12, "phases": 1}  # the lane that waits is at a step 13
+    np.testing.assert_array_equal(result.train_steps, [12, 24, 30])
+    assert sum(num_tests) == 12 + 12 + 10
+    np.testing.assert_array_equal(result.agent_state.num_updates, [0, 1, 2])
+    *_, actions, _, _, _ = np.moveaxis(np.asarray(result.agent_state.batch.rows), -1, 0)
+    second, third = np.arange(13), np.arange(13, 26)  # steps of the last full rollout
+    expected = np.zeros(13), WHO * (second // 2) + second % 2, WHO * (third // 3) + third % 3
+    np.testing.assert_array_equal(actions, expected)
 
 
 def test_a_time_limit_is_never_terminal_in_an_se():

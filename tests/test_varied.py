@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
-from support import assert_close, random_columns, shapes_of
+from support import assert_close, random_columns, raveled, shapes_of
 
 import sejax
 from sejax import envs
@@ -90,16 +89,8 @@ def random_batch(num_columns, seed):
 def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use():
     configs = [configured(SMALL, NUM_COLUMNS), configured(LARGE, BATCH)]
     small, large = (DDQN(config, OBS_DIM, NUM_ACTIONS).agent() for config in configs)
-    templates = [
-        shapes_of(config.network(NUM_ACTIONS).init, KEY, np.zeros(OBS_DIM)) for config in configs
-    ]
-
-    @jax.jit
-    def widened(params):
-        """The small agent's parameters in the large one."""
-        _, unravel_small = ravel_pytree(templates[0])
-        return ravel_pytree(embed(unravel_small(params), templates[1]))[0]
-
+    like = shapes_of(large.init, KEY, large.hparams).params
+    widened = jax.jit(lambda params: embed(params, like))
     state = jax.jit(small.init)(jax.random.key(0), small.hparams)
     hparams = large.hparams.replace(hidden_size=jnp.float32(SMALL),
                                      batch_size=jnp.float32(NUM_COLUMNS))  # fmt: skip
@@ -113,9 +104,9 @@ def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use():
         cut = jax.tree.map(lambda x: x[..., :NUM_COLUMNS] if np.ndim(x) else x, batch)
         state = update(jax.random.key(step), state, cut)
         wide = update_wide(jax.random.key(step), wide, batch._replace(weight=weight))
-    np.testing.assert_allclose(wide.params, widened(state.params), rtol=2e-5, atol=2e-6)
-    in_use = np.asarray(widened(np.ones_like(state.params)))
-    np.testing.assert_array_equal(np.asarray(wide.params)[in_use == 0], 0.0)
+    assert_close(wide.params, widened(state.params), rtol=2e-5, atol=2e-6)
+    in_use = raveled(widened(jax.tree.map(np.ones_like, state.params)))
+    np.testing.assert_array_equal(raveled(wide.params)[in_use == 0], 0.0)
 
 
 def test_narrowed_weights_are_distributed_as_those_of_a_small_network():
@@ -192,12 +183,12 @@ def test_every_drawn_agent_finds_the_smallest_network_with_room():
     bounds = ranges_of(config)
     assert set(values) == set(bounds)
     sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
-    shapes = [jax.eval_shape(x.init, KEY, x.hparams).params.shape for x in varied.agents]
+    lengths = [raveled(shapes_of(x.init, KEY, x.hparams).params).size for x in varied.agents]
     hidden, depths = values["hidden_size"].tolist(), values["num_layers"].tolist()
     for variant, width, depth in zip(variants.tolist(), hidden, depths, strict=True):
         size = min(size for size in sizes[int(depth)] if size >= width)
         inner = (int(depth) - 1) * size * (size + 1)
-        assert shapes[variant] == (size * 5 + inner + 2 * (size + 1),)
+        assert lengths[variant] == size * 5 + inner + 2 * (size + 1)
     assert len(set(variants.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
 
 

@@ -3,7 +3,7 @@
 import jax
 import torch
 from support import raveled
-from test_icm import CONFIG, GOLDEN, KINDS, WIDTH, curious, model_of, random_batch
+from test_icm import CONFIG, GOLDEN, KINDS, WIDTH, curious, random_batch
 from torch.nn import functional
 from torch_networks import TorchMLP, dense_arrays, linear, tensors, write_golden
 
@@ -65,7 +65,7 @@ class TorchICM(torch.nn.Module):
 def initial(kind):
     agent = curious(kind)
     params = agent.init(jax.random.key(1), agent.hparams).params
-    return TorchICM(model_of(CONFIG)[1](params)["params"])
+    return TorchICM(params["params"])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from test_ppo import (
     KINDS,
     MAX_ACTION,
     STEPS,
-    networks,
     ppo,
     random_steps,
 )
@@ -125,7 +124,7 @@ class TorchPPO:
 def initial(kind):
     agent = ppo(kind)
     params = agent.init(jax.random.key(1), agent.hparams).params
-    return TorchPPO(kind, networks(kind)[2](params))
+    return TorchPPO(kind, params)
 
 
 if __name__ == "__main__":

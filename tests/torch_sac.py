@@ -15,7 +15,6 @@ from test_sac import (
     GOLDEN,
     case_batch,
     case_noise,
-    nested,
     state_of,
 )
 from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
@@ -29,7 +28,7 @@ class TorchSAC:
     def __init__(self, case):
         self.is_discrete, self.config = CASES[case]
         activation = self.config.activation
-        params, target_critics = nested(case, state_of(case))
+        params, target_critics = state_of(case).params, state_of(case).target_critics
 
         def pair(critics):
             return torch.nn.ModuleList(

@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import numpy as np
 import torch
 from support import raveled
@@ -13,7 +14,6 @@ from test_td3 import (
     case_batch,
     case_noise,
     initial_params,
-    nested_params,
 )
 from torch_networks import TorchMLP, follow, tensors, write_golden
 
@@ -26,11 +26,12 @@ class TorchTD3:
     def __init__(self, params, config):
         self.config = config
         self.is_discrete = isinstance(config, DiscreteTD3Config)
-        actor, critics, target_actor, target_critics = nested_params(config, params)
         network = functools.partial(TorchMLP, activation=config.activation)
-        self.actor, self.target_actor = network(actor), network(target_actor)
+        nested = {name: x["params"] for name, x in params.items()}
+        self.actor, self.target_actor = network(nested["actor"]), network(nested["target_actor"])
         self.critics, self.target_critics = (
-            list(map(network, x)) for x in (critics, target_critics)
+            [network(jax.tree.map(lambda x, i=i: x[i], nested[name])) for i in range(2)]
+            for name in ("critics", "target_critics")
         )
         rate = config.learning_rate
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=rate)

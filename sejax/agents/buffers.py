@@ -10,13 +10,13 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
 from sejax.ops.keys import murmur, words
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
-State = TypeVar("State")  # of an agent
+T = TypeVar("T")
 
 # Columns of the reward and the discount in a packed transition.
 _REWARD, _DISCOUNT = -2, -1
@@ -53,11 +53,9 @@ class Rollout(NamedTuple):
 
     Attributes:
       rows: packed transitions with one more column, which is 1 where the episode ended.
-      is_full: whether the rollout has its whole length, so that the agent learns from it now.
     """
 
     rows: Float[Array, "steps width"]
-    is_full: Bool[Array, ""]
 
     @property
     def ended(self) -> Float[Array, " steps"]:
@@ -70,18 +68,6 @@ class Rollout(NamedTuple):
         action_dim = steps.shape[0] - 2 * obs_dim - 2
         is_index = is_discrete and action_dim == 1
         return unpack(steps, None if is_index else action_dim)
-
-    def learn_if_full(self, learn: Callable[[State], State], state: State) -> State:
-        """`learn(state)` if the rollout is full; else the state, at next to no cost.
-
-        It is a loop of one trip or none: under `vmap` `lax.cond` would learn in every step and
-        throw it away, whereas this loop runs only when the rollout of some agent is full.
-        """
-
-        def phase(carry: tuple[Array, State]) -> tuple[Array, State]:
-            return jnp.bool_(False), learn(carry[1])
-
-        return jax.lax.while_loop(lambda carry: carry[0], phase, (self.is_full, state))[1]
 
     def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
         """The same steps with a bonus added to each reward."""
@@ -99,15 +85,13 @@ class Buffer:
       batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
         `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
         is not None, have weight 0.
-      mask: `(batch, active) -> batch`, a batch on which the update of an agent that has finished is
-        cheap. Under `vmap` that update still runs, until all agents have finished, and is thrown
-        away. By default the batch stays as it is, since most updates always take as long.
+      learns_every: steps from one update to the next; above 1 `batch` has no transition but None.
     """
 
     init: Callable[[], PyTree]
     store: Callable[[PyTree, Array, Transition, Array, Array | bool], PyTree]
-    batch: Callable[[Array, PyTree, Array, Transition, Array | None], PyTree]
-    mask: Callable[[PyTree, Array | bool], PyTree] = lambda batch, active: batch
+    batch: Callable[[Array, PyTree, Array, Transition | None, Array | None], PyTree]
+    learns_every: int = 1
 
 
 # `(example, max_steps) -> Buffer`: for transitions like `example`, of which there are at most
@@ -144,10 +128,8 @@ def rollout_buffer(length: int) -> BufferMaker:
             store=lambda rows, step, transition, ended, active: write_row(
                 rows, step, jnp.append(pack(transition), jnp.float32(ended)), active
             ),
-            batch=lambda key, rows, num_steps, transition, in_use: Rollout(
-                rows=rows, is_full=num_steps % length == 0
-            ),
-            mask=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
+            batch=lambda key, rows, num_steps, transition, in_use: Rollout(rows),
+            learns_every=length,
         )
 
     return make
@@ -305,11 +287,11 @@ def block_size(width: int) -> int:
     return max(cpu.MIN_BLOCK, cpu.whole_vectors(-(-width // cpu.NUM_BLOCKS)))
 
 
-def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Array | None) -> Array:
+def sum_over_batch(fn: Callable[[PyTree], T], batch: PyTree, batch_size: Array | None) -> T:
     """Sum of `fn` over the columns of a batch, at the cost of those that are in use.
 
     Args:
-      fn: `batch -> Array`, a sum over the batch's columns in which those of weight 0 count nothing.
+      fn: of a batch, a pytree of sums over its columns, in which those of weight 0 count nothing.
       batch: pytree of arrays whose last axis are the columns, as many as `sample` draws; scalars
         belong to all of them.
       batch_size: columns that count, from the first on, `[]`; the others must have weight 0. None
@@ -322,7 +304,7 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
         return fn(batch)
     size = block_size(max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x)))
 
-    def block(index: Array) -> Array:
+    def block(index: Array) -> T:
         def cut(x: Array) -> Array:
             if not jnp.ndim(x):
                 return x
@@ -331,6 +313,9 @@ def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Arr
         return fn(jax.tree.map(cut, batch))
 
     num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
-    shape = jax.eval_shape(block, num_blocks)
-    zero = jnp.zeros(shape.shape, shape.dtype)
-    return jax.lax.fori_loop(0, num_blocks, lambda i, total: total + block(i), zero)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
+
+    def add(index: Array, total: T) -> T:
+        return jax.tree.map(jnp.add, total, block(index))
+
+    return jax.lax.fori_loop(0, num_blocks, add, zeros)

@@ -7,21 +7,22 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import FlatNetwork, OffPolicy, OffPolicyOptions, adam_step, soft_update
+from sejax.agents.off_policy import ADAM, OffPolicy, OffPolicyOptions, adam_step, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
-from sejax.ops import cpu, flat
-from sejax.ops.networks import DuelingMLP
+from sejax.ops import cpu
+from sejax.ops.networks import DuelingMLP, init_narrowed
 from sejax.options import MOST_LAYERS, counts, fraction, option
 
 
@@ -101,8 +102,8 @@ class DQNConfig(DDQNConfig):
 class DDQNState(struct.PyTreeNode):
     """One agent."""
 
-    params: Float[Array, " num_params"]
-    target_params: Float[Array, " num_params"]
+    params: PyTree
+    target_params: PyTree
     opt_state: optax.OptState
     epsilon: Array
     num_steps: Int[Array, ""]  # agent steps since it first learned
@@ -124,16 +125,16 @@ class DDQN(OffPolicy):
     config: DDQNConfig
 
     def __init__(self, config: DDQNConfig, obs_dim: int, num_actions: int):
-        self.config = config
-        self.network = FlatNetwork(config.network(num_actions), obs_dim)
+        self.config, self.obs_dim = config, obs_dim
+        self.network = config.network(num_actions)
 
     def init(self, key: Array, hparams: Hparams) -> DDQNState:
-        params = self.network.init(key, hparams.hidden_size)
+        params = init_narrowed(self.network, key, self.obs_dim, hparams.hidden_size)
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
             target_params=params,
-            opt_state=flat.ADAM.init(params),
+            opt_state=ADAM.init(params),
             epsilon=jnp.float32(hparams.epsilon_init),
             num_steps=jnp.int32(0),
             hparams=hparams,
@@ -147,8 +148,12 @@ class DDQN(OffPolicy):
         epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
         return state.replace(epsilon=epsilon)
 
+    def q_values(self, params: PyTree, obs: Array) -> Float[Array, "actions *batch"]:
+        values: Any = self.network.apply(params, obs)
+        return values
+
     def act(self, key: Array, state: DDQNState, obs: Array, explore: bool) -> Array:
-        q_values = self.network.apply(state.params, obs)
+        q_values = self.q_values(state.params, obs)
         if not explore:
             return jnp.argmax(q_values).astype(jnp.int32)
         return epsilon_greedy(key, q_values, state.epsilon)
@@ -158,9 +163,9 @@ class DDQN(OffPolicy):
 
         Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
         """
-        hp, config, q_values = state.hparams, self.config, self.network.apply
+        hp, config, q_values = state.hparams, self.config, self.q_values
 
-        def sum_of_losses(params: Array, batch: Transition) -> Array:
+        def sum_of_losses(params: PyTree, batch: Transition) -> Array:
             target_next_q = q_values(state.target_params, batch.next_obs)  # [actions, batch]
             next_q = q_values(params, batch.next_obs) if config.double else target_next_q
             discount = hp.discount * batch.discount

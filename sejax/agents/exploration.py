@@ -11,7 +11,6 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,13 +19,13 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
+from sejax.agents.off_policy import ADAM, moved
 from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
-from sejax.ops import flat
 from sejax.ops.networks import MLP, Dense
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
 
@@ -89,7 +88,7 @@ class CuriousState(struct.PyTreeNode):
     """One curious agent: the state of the agent inside, and the module's."""
 
     agent_state: AgentState
-    params: Float[Array, " num_params"]
+    params: PyTree
     opt_state: optax.OptState
     hparams: Hparams
 
@@ -165,9 +164,8 @@ def with_icm(
 
     Before each learning step on `Transition`s the module takes one step of Adam on the batch; then
     its bonus for that batch, by the models as updated, is added to the rewards that the agent sees.
-    On a `Rollout`, where it is full, the bonus comes first and the module's one step after it; the
-    agent inside must leave its state as it is at all other times. The buffer keeps rewards without
-    the bonus, which is computed anew whenever a step is learned from.
+    On a `Rollout` the bonus comes first and the module's one step after it. The buffer keeps
+    rewards without the bonus, which is computed anew whenever a step is learned from.
 
     Args:
       agent: one that learns from batches of `Transition`s, or from a `Rollout`.
@@ -209,35 +207,32 @@ class Curious:
         self.agent, self.model = agent, model
         self.obs_dim, self.is_discrete = obs_dim, is_discrete
         self.example = (jnp.zeros(obs_dim), jnp.zeros(model.action_width), jnp.zeros(obs_dim))
-        self.unflatten = flat.unflattener(model.init, *self.example)
 
     def init(self, key: Array, hparams: Hparams) -> CuriousState:
         key_agent, key_icm = jax.random.split(key)
-        params = flat.flatten(self.model.init(key_icm, *self.example))
+        params = self.model.init(key_icm, *self.example)
         return CuriousState(
             agent_state=self.agent.init(key_agent, hparams.agent),
             params=params,
-            opt_state=flat.ADAM.init(params),
+            opt_state=ADAM.init(params),
             hparams=jax.tree.map(jnp.float32, hparams.replace(agent=None)),
         )
 
-    def outputs(self, params: Array, batch: Transition) -> ICMOutputs:
+    def outputs(self, params: PyTree, batch: Transition) -> ICMOutputs:
         action = as_vectors(batch.action, self.model.action_width)
-        outputs: Any = self.model.apply(self.unflatten(params), batch.obs, action, batch.next_obs)
+        outputs: Any = self.model.apply(params, batch.obs, action, batch.next_obs)
         return outputs
 
     def train(self, state: CuriousState, batch: Transition) -> CuriousState:
         """One step of Adam."""
         hp = state.hparams
 
-        def loss_fn(params: Array) -> Array:
+        def loss_fn(params: PyTree) -> Array:
             outputs = self.outputs(params, batch)
             return icm_loss(outputs, batch.action, hp.forward_weight, batch.weight)
 
         gradient = jax.grad(loss_fn)(state.params)
-        params, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient, hp.learning_rate
-        )
+        params, opt_state = moved(state.params, state.opt_state, gradient, hp.learning_rate)
         return state.replace(params=params, opt_state=opt_state)
 
     def bonus(self, state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
@@ -245,19 +240,14 @@ class Curious:
         return state.hparams.reward_scale * jax.lax.stop_gradient(error)
 
     def update(self, key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
+        augmented: Transition | Rollout
         if isinstance(batch, Rollout):
-            # The agent's update is inside: its rows with the bonus would else be made in each step.
-            learn = functools.partial(self.learn, key, rollout=batch)
-            return batch.learn_if_full(learn, state)
-        state = self.train(state, batch)
-        batch = batch._replace(reward=batch.reward + self.bonus(state, batch))
-        return state.replace(agent_state=self.agent.update(key, state.agent_state, batch))
-
-    def learn(self, key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
-        """A learning phase from a full rollout."""
-        batch = rollout.transitions(self.obs_dim, self.is_discrete)
-        augmented = rollout.with_bonus(self.bonus(state, batch))
-        state = self.train(state, batch)
+            steps = batch.transitions(self.obs_dim, self.is_discrete)
+            augmented = batch.with_bonus(self.bonus(state, steps))
+            state = self.train(state, steps)
+        else:
+            state = self.train(state, batch)
+            augmented = batch._replace(reward=batch.reward + self.bonus(state, batch))
         return state.replace(agent_state=self.agent.update(key, state.agent_state, augmented))
 
 

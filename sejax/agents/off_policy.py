@@ -7,18 +7,16 @@ loss. The file of an agent has its networks, its loss and its targets.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen as nn
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
-from sejax.ops import flat
-from sejax.ops.networks import MLP, init_narrowed
+from sejax.ops.networks import MLP
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -30,6 +28,9 @@ from sejax.options import (
     positive,
     require,
 )
+
+ADAM = optax.scale_by_adam()
+Params = TypeVar("Params")  # a pytree
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,41 +108,19 @@ class ActorCritic(OffPolicy):
         return state.replace(is_warming_up=jnp.asarray(episode < self.config.warmup_episodes))
 
 
-class FlatNetwork:
-    """A network as functions of its parameters as one vector, which Adam moves fastest.
-
-    Args:
-      network: for inputs `[num_inputs, *batch]`.
-      num_inputs: of the network.
-    """
-
-    def __init__(self, network: nn.Module, num_inputs: int):
-        self.network, self.num_inputs = network, num_inputs
-        self.unflatten = flat.unflattener(network.init, jnp.zeros(num_inputs))
-
-    def init(self, key: Array, hidden_size: Array | None) -> Float[Array, " num_params"]:
-        """Fresh parameters; `hidden_size` is the number of units in use, or None for all."""
-        return flat.flatten(init_narrowed(self.network, key, self.num_inputs, hidden_size))
-
-    def apply(self, params: Float[Array, " num_params"], x: Array) -> Array:
-        """The outputs, `[out, *batch]`, for `x [in, *batch]`."""
-        outputs: Any = self.network.apply(self.unflatten(params), x)
-        return outputs
-
-
 def adam_step(
     sum_of_losses: Callable[..., Array],
-    params: Float[Array, "*params"],
+    params: Params,
     opt_state: optax.OptState,
     columns: tuple[Transition, *tuple[PyTree, ...]],
     hparams: Hparams,
-) -> tuple[Float[Array, "*params"], optax.OptState]:
+) -> tuple[Params, optax.OptState]:
     """One step of Adam on a batch's mean loss, at the cost of the columns in use.
 
     Args:
       sum_of_losses: `(params, *columns) -> []`, the losses of the columns times their weights.
       params: to move.
-      opt_state: of `flat.ADAM`.
+      opt_state: of `ADAM`.
       columns: a batch, and what else has its columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
     """
@@ -149,12 +128,19 @@ def adam_step(
     total = sum_over_batch(
         lambda columns: jax.grad(sum_of_losses)(params, *columns), columns, hparams.batch_size
     )
-    mean = total / num_columns(columns[0])
-    return flat.adam_step(params, opt_state, mean, hparams.learning_rate)
+    count = num_columns(columns[0])
+    gradient = jax.tree.map(lambda x: x / count, total)
+    return moved(params, opt_state, gradient, hparams.learning_rate)
 
 
-def soft_update(
-    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Array | float
-) -> Float[Array, "*params"]:
+def moved(
+    params: Params, opt_state: optax.OptState, gradient: Params, learning_rate: Array | float
+) -> tuple[Params, optax.OptState]:
+    """A step of `optax.adam` with a traced learning rate."""
+    directions, opt_state = ADAM.update(gradient, opt_state)
+    return jax.tree.map(lambda x, dx: x - learning_rate * dx, params, directions), opt_state
+
+
+def soft_update(target: Params, online: Params, tau: Array | float) -> Params:
     """The parameters of a target network that follows the online one with weight `tau`."""
-    return tau * online + (1 - tau) * target
+    return jax.tree.map(lambda x, y: tau * x + (1 - tau) * y, online, target)

@@ -29,11 +29,12 @@ from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
-from sejax.ops import flat
+from sejax.ops import cpu
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
+    LARGEST,
     MOST_LAYERS,
     MOVES,
     counts,
@@ -46,7 +47,7 @@ from sejax.options import (
 )
 
 Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
-Moved = tuple[Array, optax.OptState]  # parameters, and the optimizer's state
+Moved = tuple[PyTree, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
@@ -146,7 +147,14 @@ class PPOConfig(AgentOptions):
 
     def spec(self) -> AgentSpec:
         # It learns from the start; `warmup_episodes` only holds back the stop rule.
-        return dataclasses.replace(super().spec(), learns_from=0, action_repeat=self.action_repeat)
+        minibatch = (self.rollout_steps or LARGEST) // self.num_minibatches
+        is_small = self.hidden_size * minibatch <= cpu.SMALL_PRODUCT
+        return dataclasses.replace(
+            super().spec(),
+            learns_from=0,
+            action_repeat=self.action_repeat,
+            cpu_num_parallel=cpu.SMALL_NUM_PARALLEL if is_small else 1,
+        )
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam's direction, of a gradient that may be shortened first."""
@@ -157,9 +165,9 @@ class PPOConfig(AgentOptions):
 
 
 class PPOState(struct.PyTreeNode):
-    """One agent. `params` are the actor's, the critic's and the std, as one flat vector."""
+    """One agent. `params` are `{"actor", "critic", "std"}`."""
 
-    params: Float[Array, " num_params"]
+    params: dict[str, PyTree]
     opt_state: optax.OptState
     return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
     hparams: Hparams
@@ -184,8 +192,7 @@ class Batch(NamedTuple):
 class PPO(Learner):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    `update` learns once the rollout is full and costs next to nothing before, under `vmap` too. A
-    tree of parameters has the keys actor, whose outputs are logits, critic and std.
+    Parameters have the keys actor, whose outputs are logits, critic and std.
 
     Args:
       config: hyperparameters.
@@ -227,16 +234,11 @@ class PPO(Learner):
             MLP(size, *shape, learn_prelu_slope=True) for size in (action_dim, 1)
         )
         self.optimizer = config.optimizer()
-        template = jax.eval_shape(self.init_tree, jax.random.key(0))
-        self.unflatten = flat.inverse_of_flatten(template)
-        unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
-        # Lower bounds of flat parameters: only the std has one.
-        self.least = flat.flatten({**unbounded, "std": jnp.full(self.std_dim, MIN_STD)})
 
     def buffer(self) -> BufferMaker:
         return rollout_buffer(self.length)
 
-    def init_tree(self, key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
+    def init_params(self, key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
         key_actor, key_critic = jax.random.split(key)
         return {
             "actor": init_narrowed(self.actor, key_actor, self.obs_dim, hidden_size),
@@ -245,7 +247,7 @@ class PPO(Learner):
         }
 
     def init(self, key: Array, hparams: Hparams) -> PPOState:
-        params = flat.flatten(self.init_tree(key, hparams.hidden_size))
+        params = self.init_params(key, hparams.hidden_size)
         return PPOState(
             params=params,
             opt_state=self.optimizer.init(params),
@@ -254,31 +256,46 @@ class PPO(Learner):
         )
 
     def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
-        tree = self.unflatten(state.params)
-        outputs: Any = self.actor.apply(tree["actor"], obs)
-        return self.sample(key, outputs, tree["std"]) if explore else self.mode(outputs)
+        outputs: Any = self.actor.apply(state.params["actor"], obs)
+        return self.sample(key, outputs, state.params["std"]) if explore else self.mode(outputs)
 
-    def value(self, tree: PyTree, obs: Array) -> Steps:
+    def value(self, params: PyTree, obs: Array) -> Steps:
         """The critic's."""
-        outputs: Any = self.critic.apply(tree["critic"], obs)
+        outputs: Any = self.critic.apply(params["critic"], obs)
         return outputs[0]
 
-    def evaluate(self, tree: PyTree, obs: Array, action: Array) -> tuple[Steps, Steps, Steps]:
+    def evaluate(self, params: PyTree, obs: Array, action: Array) -> tuple[Steps, Steps, Steps]:
         """The actions' log probabilities, the entropies and the values."""
-        outputs: Any = self.actor.apply(tree["actor"], obs)
-        log_prob, entropy = self.probabilities(outputs, tree["std"], action)
-        return log_prob, entropy, self.value(tree, obs)
+        outputs: Any = self.actor.apply(params["actor"], obs)
+        log_prob, entropy = self.probabilities(outputs, params["std"], action)
+        return log_prob, entropy, self.value(params, obs)
 
     def update(self, key: Array, state: PPOState, batch: Rollout) -> PPOState:
-        """A learning phase where the rollout is full, and else nothing."""
+        """A learning phase.
 
-        def phase(state: PPOState) -> PPOState:
-            # XLA would move what does not depend on the carry out of the loop, into every step.
-            inputs = (key, state.params, batch.rows)
-            phase_key, params, rows = jax.lax.optimization_barrier(inputs)
-            return self.learn(phase_key, state.replace(params=params), batch._replace(rows=rows))
+        It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
+        steps. A rollout that these do not divide leaves some steps out of each pass.
+        """
+        config, hp = self.config, state.hparams
+        steps = batch.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
+        rollout, return_sums = self.prepared(state, steps, batch.ended)
+        order = shuffled(key, config.epochs, config.num_minibatches, rollout.returns.size)
 
-        return batch.learn_if_full(phase, state)
+        def adam_step(number: Array, carry: Moved) -> Moved:
+            params, opt_state = carry
+            minibatch = rollout
+            if config.num_minibatches > 1:
+                minibatch = jax.tree.map(lambda x: x[..., order[number]], rollout)
+            gradient = jax.grad(self.loss)(params, minibatch, hp)
+            directions, opt_state = self.optimizer.update(gradient, opt_state)
+            params = jax.tree.map(lambda x, dx: x - hp.learning_rate * dx, params, directions)
+            return params | {"std": jnp.maximum(params["std"], MIN_STD)}, opt_state
+
+        num_updates = config.epochs * config.num_minibatches
+        params, opt_state = jax.lax.fori_loop(
+            0, num_updates, adam_step, (state.params, state.opt_state)
+        )
+        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
     def prepared(
         self, state: PPOState, steps: Transition, ended: Steps
@@ -304,8 +321,8 @@ class PPO(Learner):
 
         Source: Schulman et al. (2016), eq. 11 to 16.
         """
-        hp, tree, sums = state.hparams, self.unflatten(state.params), state.return_sums
-        old_log_prob, _, value = self.evaluate(tree, steps.obs, steps.action)
+        hp, params, sums = state.hparams, state.params, state.return_sums
+        old_log_prob, _, value = self.evaluate(params, steps.obs, steps.action)
         if self.config.advantages == "monte_carlo":
             decay = jnp.broadcast_to(hp.discount, ended.shape)
             returns = normalized(discounted_sums(steps.reward, decay, ended))
@@ -314,38 +331,11 @@ class PPO(Learner):
         if self.config.normalize_rewards:
             sums = sums + power_sums(discounted_sums(reward, decay, ended))
             reward = reward / std_of(sums)
-        delta = reward + decay * self.value(tree, steps.next_obs) - value
+        delta = reward + decay * self.value(params, steps.next_obs) - value
         advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
         return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
 
-    def learn(self, key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        """A learning phase.
-
-        It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
-        steps. A rollout that these do not divide leaves some steps out of each pass.
-        """
-        config, hp = self.config, state.hparams
-        steps = rollout.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
-        batch, return_sums = self.prepared(state, steps, rollout.ended)
-        order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
-
-        def adam_step(number: Array, carry: Moved) -> Moved:
-            params, opt_state = carry
-            minibatch = batch
-            if config.num_minibatches > 1:
-                minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
-            gradient = jax.grad(self.loss)(self.unflatten(params), minibatch, hp)
-            direction: Any
-            direction, opt_state = self.optimizer.update(flat.flatten(gradient), opt_state)
-            return jnp.maximum(params - hp.learning_rate * direction, self.least), opt_state
-
-        num_updates = config.epochs * config.num_minibatches
-        params, opt_state = jax.lax.fori_loop(
-            0, num_updates, adam_step, (state.params, state.opt_state)
-        )
-        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
-
-    def loss(self, tree: PyTree, batch: Batch, hp: Hparams) -> Float[Array, ""]:
+    def loss(self, params: PyTree, batch: Batch, hp: Hparams) -> Float[Array, ""]:
         r"""What a learning phase minimises.
 
         .. math:: -\overline{\min(\rho A, \mathrm{clip}(\rho, 1-\epsilon, 1+\epsilon) A)}
@@ -356,7 +346,7 @@ class PPO(Learner):
 
         Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
         """
-        log_prob, entropy, value = self.evaluate(tree, batch.obs, batch.action)
+        log_prob, entropy, value = self.evaluate(params, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
         else:
@@ -421,8 +411,7 @@ def shuffled(
 
     Each epoch's steps are sorted by random bits, whose last ones are the step's number: a sort of
     single numbers takes a fifth of the time of `jax.random.permutation`. The bits are MurmurHash3's
-    finaliser of counters that start at random, since XLA would move what threefry does with
-    counters that start at 0 out of the learning phase, into every step.
+    finaliser of counters that start at random.
     """
     size = num_steps // num_minibatches
     counter = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)

@@ -21,10 +21,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, soft_update
+from sejax.agents.off_policy import ADAM, ActorCritic, ActorCriticOptions, adam_step, soft_update
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
-from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
 from sejax.options import finite, fraction, not_negative, option, positive, require, shortened
 
@@ -76,10 +75,10 @@ class SACConfig(ActorCriticOptions):
 
 
 class SACState(struct.PyTreeNode):
-    """One agent. Parameters are flat: the actor's, both critics' and log alpha in one vector."""
+    """One agent."""
 
-    params: Float[Array, " num_params"]
-    target_critics: Float[Array, " num_critic_params"]
+    params: "Params"
+    target_critics: PyTree
     opt_state: optax.OptState
     is_warming_up: Bool[Array, ""]
     hparams: Hparams
@@ -130,11 +129,6 @@ class SAC(ActorCritic):
         num_outputs, self.action_inputs, num_values = self.sizes()
         self.actor, self.critic = config.mlp(num_outputs), config.mlp(num_values)
         self.critics = jax.vmap(self.critic.apply, (0, None))
-        template = jax.eval_shape(self.init_params, jax.random.key(0), Hparams(init_alpha=1.0))
-        self.unflatten = flat.inverse_of_flatten(template)
-        self.unflatten_critics = flat.inverse_of_flatten(template.critics)
-        start, size = (sum(x.size for x in jax.tree.leaves(part)) for part in template[:2])
-        self.critics_of = lambda params: params[start : start + size]
 
     def init_params(self, key: Array, hparams: Hparams) -> Params:
         key_actor, key_critics = jax.random.split(key)
@@ -147,11 +141,11 @@ class SAC(ActorCritic):
         )
 
     def init(self, key: Array, hparams: Hparams) -> SACState:
-        params = flat.flatten(self.init_params(key, hparams))
+        params = self.init_params(key, hparams)
         return SACState(
             params=params,
-            target_critics=self.critics_of(params),
-            opt_state=flat.ADAM.init(params),
+            target_critics=params.critics,
+            opt_state=ADAM.init(params),
             is_warming_up=jnp.bool_(self.config.warmup_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
@@ -162,7 +156,7 @@ class SAC(ActorCritic):
         return outputs
 
     def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
-        outputs = self.outputs(self.unflatten(state.params), obs)
+        outputs = self.outputs(state.params, obs)
         if not explore:
             return self.best(outputs)
         return self.sample(key, outputs, state.is_warming_up)
@@ -176,18 +170,16 @@ class SAC(ActorCritic):
         Source: Haarnoja et al. (2018), algorithm 1; Christodoulou (2019), algorithm 1.
         """
 
-        def sum_of_losses(params: Array, batch: Transition, noise: LearningNoise) -> Array:
-            losses = self.losses(self.unflatten(params), state, batch, noise)
-            return jnp.sum(batch.weight * losses)
+        def sum_of_losses(params: Params, batch: Transition, noise: LearningNoise) -> Array:
+            return jnp.sum(batch.weight * self.losses(params, state, batch, noise))
 
         params, opt_state = adam_step(
             sum_of_losses, state.params, state.opt_state, (batch, noise), state.hparams
         )
-        critics, tau = self.critics_of(params), state.hparams.tau
         return state.replace(
             params=params,
             opt_state=opt_state,
-            target_critics=soft_update(state.target_critics, critics, tau),
+            target_critics=soft_update(state.target_critics, params.critics, state.hparams.tau),
         )
 
     def losses(
@@ -207,10 +199,9 @@ class SAC(ActorCritic):
         Source: Haarnoja et al. (2018), eq. 5, 7 and 18; Christodoulou (2019), eq. 10 to 12.
         """
         hp, fixed = state.hparams, jax.lax.stop_gradient(params)
-        target_critics = self.unflatten_critics(state.target_critics)
         online, online_fixed, target = (
             functools.partial(self.critics, critics)
-            for critics in (params.critics, fixed.critics, target_critics)
+            for critics in (params.critics, fixed.critics, state.target_critics)
         )
         alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
         next_q, next_entropy = self.expected(

@@ -8,26 +8,19 @@ hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    ActorCritic,
-    ActorCriticOptions,
-    FlatNetwork,
-    adam_step,
-    soft_update,
-)
+from sejax.agents.off_policy import ADAM, ActorCritic, ActorCriticOptions, adam_step, soft_update
 from sejax.envs.base import Task
-from sejax.ops import flat
-from sejax.ops.networks import MLP
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import MOVES, counts, fraction, not_negative, option, positive
 
 _MIN_TEMPERATURE = 1e-6
@@ -96,12 +89,12 @@ class DiscreteTD3Config(TD3Config):
 
 
 class TD3State(struct.PyTreeNode):
-    """One agent. Parameters are flat; the two critics' are the rows of one array."""
+    """One agent. The leaves of the two critics are `[2, ...]`."""
 
-    actor: Float[Array, " num_actor_params"]
-    critics: Float[Array, "2 num_critic_params"]
-    target_actor: Float[Array, " num_actor_params"]
-    target_critics: Float[Array, "2 num_critic_params"]
+    actor: PyTree
+    critics: PyTree
+    target_actor: PyTree
+    target_critics: PyTree
     actor_opt_state: optax.OptState
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
@@ -139,29 +132,30 @@ class TD3(ActorCritic):
     config: TD3Config
 
     def __init__(self, config: TD3Config, obs_dim: int, action_dim: int, max_action: float):
-        self.config, self.action_dim, self.max_action = config, action_dim, max_action
-        self.actor = FlatNetwork(config.mlp(action_dim), obs_dim)
-        self.critic = FlatNetwork(config.mlp(1), obs_dim + action_dim)
+        self.config, self.obs_dim = config, obs_dim
+        self.action_dim, self.max_action = action_dim, max_action
+        self.actor, self.critic = config.mlp(action_dim), config.mlp(1)
 
     def init(self, key: Array, hparams: Hparams) -> TD3State:
         key_actor, key_critics = jax.random.split(key)
-        init_critics = jax.vmap(self.critic.init, (0, None))
-        critics = init_critics(jax.random.split(key_critics), hparams.hidden_size)
-        actor = self.actor.init(key_actor, hparams.hidden_size)
+        num_inputs, size = self.obs_dim + self.action_dim, hparams.hidden_size
+        init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
+        critics = init_critics(jax.random.split(key_critics))
+        actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
         return TD3State(
             actor=actor,
             critics=critics,
             target_actor=actor,
             target_critics=critics,
-            actor_opt_state=flat.ADAM.init(actor),
-            critic_opt_state=flat.ADAM.init(critics),
+            actor_opt_state=ADAM.init(actor),
+            critic_opt_state=ADAM.init(critics),
             num_updates=jnp.int32(0),
             is_warming_up=jnp.bool_(self.config.warmup_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
     def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
-        outputs = self.actor.apply(state.actor, obs)
+        outputs = self.outputs(state.actor, obs)
         if not explore and not self.config.noisy_tests:
             return self.best(outputs)
         key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
@@ -203,7 +197,7 @@ class TD3(ActorCritic):
     def update_critics(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
         hp, q_values = state.hparams, jax.vmap(self.q_value, (0, None, None))
 
-        def sum_of_losses(critics: Array, batch: Transition, noise: LearningNoise) -> Array:
+        def sum_of_losses(critics: PyTree, batch: Transition, noise: LearningNoise) -> Array:
             next_action = self.smoothed_target_action(state, batch.next_obs, noise)
             next_q = jnp.min(q_values(state.target_critics, batch.next_obs, next_action), axis=0)
             targets = batch.reward + hp.discount * batch.discount * next_q
@@ -216,12 +210,11 @@ class TD3(ActorCritic):
         return state.replace(critics=critics, critic_opt_state=opt_state)
 
     def update_actor(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        hp = state.hparams
+        hp, critic = state.hparams, jax.tree.map(lambda x: x[0], state.critics)
 
-        def sum_of_losses(actor: Array, batch: Transition, noise: LearningNoise) -> Array:
-            outputs = self.actor.apply(actor, batch.obs)
-            action = self.action(outputs, noise.policy, state)
-            return -jnp.sum(batch.weight * self.q_value(state.critics[0], batch.obs, action))
+        def sum_of_losses(actor: PyTree, batch: Transition, noise: LearningNoise) -> Array:
+            action = self.action(self.outputs(actor, batch.obs), noise.policy, state)
+            return -jnp.sum(batch.weight * self.q_value(critic, batch.obs, action))
 
         actor, opt_state = adam_step(
             sum_of_losses, state.actor, state.actor_opt_state, (batch, noise), hp
@@ -233,9 +226,15 @@ class TD3(ActorCritic):
             target_critics=soft_update(state.target_critics, state.critics, hp.tau),
         )
 
-    def q_value(self, critic: Array, obs: Array, action: Array) -> Float[Array, "*batch"]:
+    def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "action_dim *batch"]:
+        """The actor's."""
+        outputs: Any = self.actor.apply(actor, obs)
+        return outputs
+
+    def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
         """Of one of the critics."""
-        return self.critic.apply(critic, jnp.concatenate([obs, action]))[0]
+        values: Any = self.critic.apply(critic, jnp.concatenate([obs, action]))
+        return values[0]
 
     def smoothed_target_action(self, state: TD3State, obs: Array, noise: LearningNoise) -> Array:
         r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, as allowed.
@@ -244,7 +243,7 @@ class TD3(ActorCritic):
         """
         hp, clip = state.hparams, state.hparams.target_noise_clip
         smoothing = jnp.clip(hp.target_noise_std * noise.smoothing, -clip, clip)
-        outputs = self.actor.apply(state.target_actor, obs)
+        outputs = self.outputs(state.target_actor, obs)
         action = self.action(outputs, noise.target_policy, state)
         return self.restrict(action + self.max_action * smoothing)
 

@@ -7,10 +7,10 @@ DDQN in a CartPole SE, in turns with the plain form.
 =================== ======================================== ================================
 fast                plain                                    gain
 =================== ======================================== ================================
+`in_batches_on_cpu` `jax.vmap`, all agents at once           1.7 times, TD3 of 2 x 256 units
 `while_any_active`  `jax.lax.while_loop` under `vmap`        9 times, 8 agents, 20,000 rows
 `networks.affine`   `kernel @ x + bias`                      1.3 times
 `networks.tanh`     `jnp.tanh`                               1.1 times (paper's DDQN)
 `keys.step_keys`    `jax.random.split(fold_in(key, step))`   1.06 times
-`flat.adam_step`    `optax.adam` on a pytree of four arrays  3 times, Adam alone
 =================== ======================================== ================================
 """

@@ -22,7 +22,7 @@ STEPS_PER_CHECK = 16
 
 
 def while_any_active(
-    body: Body, large: PyTree, small: PyTree, consts: PyTree
+    body: Body, large: PyTree, small: PyTree, consts: PyTree, per_check: int = STEPS_PER_CHECK
 ) -> tuple[PyTree, PyTree]:
     """Runs `large, small = body(large, small, consts, masked)` while `small.active`.
 
@@ -40,6 +40,7 @@ def while_any_active(
       large: pytree of arrays that must be updated in place, such as a replay buffer.
       small: dataclass pytree with a bool scalar `active`; cheap to select over.
       consts: pytree that the body only reads.
+      per_check: iterations between two looks at the predicate, where a host waits for it.
 
     Returns:
       The last `large` and `small`.
@@ -63,11 +64,11 @@ def while_any_active(
       >>> jax.vmap(count_to)(jnp.array([3, 1])).tolist()
       [[1, 2, 3], [1, 0, 0]]
     """
-    return _while_any_active(body, 0, large, small, consts)
+    return _while_any_active(body, 0, per_check, large, small, consts)
 
 
 def _while_any_active(
-    body: Body, depth: int, large: PyTree, small: PyTree, consts: PyTree
+    body: Body, depth: int, per_check: int, large: PyTree, small: PyTree, consts: PyTree
 ) -> tuple[PyTree, PyTree]:
     """The loop under `depth` vmaps, which makes itself one deeper when it is vmapped."""
 
@@ -97,7 +98,7 @@ def _while_any_active(
             return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
 
         def block(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-            return jax.lax.fori_loop(0, STEPS_PER_CHECK, lambda _, each: step(each), carry)
+            return jax.lax.fori_loop(0, per_check, lambda _, each: step(each), carry)
 
         def advance(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             if depth == 0:  # a step of a loop that has ended is not masked
@@ -113,7 +114,7 @@ def _while_any_active(
 
         # The deeper loop captures for itself what is the same for all elements.
         out = _while_any_active(
-            body, depth + 1, *jax.tree.map(broadcast, in_batched[:3], list(args[:3]))
+            body, depth + 1, per_check, *jax.tree.map(broadcast, in_batched[:3], list(args[:3]))
         )
         return out, jax.tree.map(lambda _: True, out)
 

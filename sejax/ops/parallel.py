@@ -6,15 +6,19 @@ any number of devices (`tests/test_parallel.py`).
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_batching import custom_vmap
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from sejax.options import require
+
+T = TypeVar("T")
 
 
 @functools.cache
@@ -151,13 +155,58 @@ def map_in_batches(
     width = width or size
     if width == 1:
         return jax.lax.map(lambda args: fn(*args), args)
+    if width == size:
+        return jax.vmap(fn)(*args)
     # The last batch is filled up with copies: products of another width round otherwise, and a
     # result must not depend on how many elements a device has.
     num_batches = -(-size // width)
     indices = np.arange(num_batches * width) % size
-    batches = jax.tree.map(lambda x: x[indices].reshape(-1, width, *x.shape[1:]), args)
+    batches = jax.tree.map(lambda x: x[indices].reshape(num_batches, width, *x.shape[1:]), args)
     out = jax.lax.map(jax.vmap(lambda args: fn(*args)), batches)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
+    return jax.tree.map(lambda x: x.reshape(num_batches * width, *x.shape[2:])[:size], out)
+
+
+def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., T]:
+    """A function of one element whose `vmap` takes so many elements at a time on a CPU.
+
+    Plain form: `fn`, which `vmap` moves for all elements at once, through all their memory in each
+    step: TD3 with two layers of 256 units takes 1.7 times as long then. It is `fn` elsewhere.
+
+    Args:
+      fn: a function of one element.
+      width: elements in one vmapped batch; None for all.
+
+    Example:
+      >>> square = in_batches_on_cpu(jnp.square, 1)
+      >>> jax.vmap(square)(jnp.arange(3)).tolist()
+      [0, 1, 4]
+    """
+
+    @custom_vmap
+    def one(args: tuple[PyTree, ...]) -> T:
+        return fn(*args)
+
+    @one.def_vmap
+    def _(size: int, in_batched: list[PyTree], args: tuple[PyTree, ...]) -> tuple[T, PyTree]:
+        is_batched = jax.tree.leaves(in_batched)
+
+        def all_of_them(*args: PyTree) -> T:
+            leaves, structure = jax.tree.flatten(args)
+
+            def run(*elements: Array) -> T:
+                rest = iter(elements)
+                pairs = zip(is_batched, leaves, strict=True)
+                whole = [next(rest) if x else leaf for x, leaf in pairs]
+                return fn(*jax.tree.unflatten(structure, whole))
+
+            batched = tuple(leaf for x, leaf in zip(is_batched, leaves, strict=True) if x)
+            return map_in_batches(run, min(width or size, size), batched)
+
+        # Under a second `vmap` one such map follows the other.
+        out = in_batches_on_cpu(all_of_them, width and 1)(*args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return lambda *args: one(args) if on_cpu() else fn(*args)
 
 
 def _deal(x: Array, num_devices: int) -> Array:

@@ -73,8 +73,8 @@ class CommandConfig(Options):
       agents: by their keys, in the order of these; see `sejax.runs.compose.agents_of`.
       exploration: intrinsic reward of the agents
       training: on proxies
-      num_parallel: Agents that train side by side on one device; null: what suits the agent and the
-        device.
+      num_parallel: Agents that train side by side on one device, on a CPU no more than are fastest;
+        null: what suits the agent and the device.
       devices: null: all
     """
 

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, UInt32
 
 from sejax.envs.mujoco import library
-from sejax.ops.flat import inverse_of_flatten
 
 
 class Report(NamedTuple):
@@ -70,8 +70,8 @@ class Physics:
         # As step.cc reports them, one after the other.
         shapes = (nq,), (nv,), (nq,), (nbody, 3), (nbody, 3), (nbody if with_forces else 0, 6)
         self._num_reported = sum(map(math.prod, shapes))
-        leaves: list[Any] = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-        self._report_of = inverse_of_flatten(Report(*leaves))
+        zeros: list[Any] = [np.zeros(shape, np.float32) for shape in shapes]
+        _, self._report_of = ravel_pytree(Report(*zeros))
 
     @property
     def dt(self) -> float:
