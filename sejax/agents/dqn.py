@@ -18,11 +18,12 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ADAM, OffPolicy, OffPolicyOptions, adam_step, soft_update
+from sejax.agents.off_policy import OffPolicy, OffPolicyOptions, adam_step, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.networks import DuelingMLP, init_narrowed
+from sejax.ops.optimizers import ADAM
 from sejax.options import MOST_LAYERS, counts, fraction, option
 
 

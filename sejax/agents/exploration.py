@@ -23,10 +23,10 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.off_policy import ADAM, moved
 from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, Dense
+from sejax.ops.optimizers import ADAM, apply_gradient
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
 
 
@@ -232,7 +232,9 @@ class Curious:
             return icm_loss(outputs, batch.action, hp.forward_weight, batch.weight)
 
         gradient = jax.grad(loss_fn)(state.params)
-        params, opt_state = moved(state.params, state.opt_state, gradient, hp.learning_rate)
+        params, opt_state = apply_gradient(
+            state.params, state.opt_state, gradient, hp.learning_rate
+        )
         return state.replace(params=params, opt_state=opt_state)
 
     def bonus(self, state: CuriousState, batch: Transition) -> Float[Array, " batch"]:

@@ -17,6 +17,7 @@ from jaxtyping import Array, PyTree
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops.networks import MLP
+from sejax.ops.optimizers import apply_gradient
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -29,7 +30,6 @@ from sejax.options import (
     require,
 )
 
-ADAM = optax.scale_by_adam()
 Params = TypeVar("Params")  # a pytree
 
 
@@ -120,7 +120,7 @@ def adam_step(
     Args:
       sum_of_losses: `(params, *columns) -> []`, the losses of the columns times their weights.
       params: to move.
-      opt_state: of `ADAM`.
+      opt_state: of `sejax.ops.optimizers.ADAM`.
       columns: a batch, and what else has its columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
     """
@@ -130,15 +130,7 @@ def adam_step(
     )
     count = num_columns(columns[0])
     gradient = jax.tree.map(lambda x: x / count, total)
-    return moved(params, opt_state, gradient, hparams.learning_rate)
-
-
-def moved(
-    params: Params, opt_state: optax.OptState, gradient: Params, learning_rate: Array | float
-) -> tuple[Params, optax.OptState]:
-    """A step of `optax.adam` with a traced learning rate."""
-    directions, opt_state = ADAM.update(gradient, opt_state)
-    return jax.tree.map(lambda x, dx: x - learning_rate * dx, params, directions), opt_state
+    return apply_gradient(params, opt_state, gradient, hparams.learning_rate)
 
 
 def soft_update(target: Params, online: Params, tau: Array | float) -> Params:

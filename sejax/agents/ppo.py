@@ -32,6 +32,7 @@ from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
+from sejax.ops.optimizers import clip_by_global_norm, scale_by_adam
 from sejax.options import (
     ACTIVATIONS,
     LARGEST,
@@ -158,10 +159,10 @@ class PPOConfig(AgentOptions):
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam's direction, of a gradient that may be shortened first."""
-        adam = optax.scale_by_adam(eps=self.adam_eps)
+        adam = scale_by_adam(self.adam_eps)
         if self.max_grad_norm is None:
             return adam
-        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), adam)
+        return optax.chain(clip_by_global_norm(self.max_grad_norm), adam)
 
 
 class PPOState(struct.PyTreeNode):
@@ -330,7 +331,7 @@ class PPO(Learner):
         decay, reward = hp.discount * steps.discount, steps.reward
         if self.config.normalize_rewards:
             sums = sums + power_sums(discounted_sums(reward, decay, ended))
-            reward = reward / std_of(sums)
+            reward = reward * (1 / std_of(sums))
         delta = reward + decay * self.value(params, steps.next_obs) - value
         advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
         return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
@@ -446,7 +447,7 @@ def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
 def normalized(x: Steps) -> Steps:
     """Numbers with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
     std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
-    return (x - jnp.mean(x)) / (std + 1e-5)
+    return (x - jnp.mean(x)) * (1 / (std + 1e-5))
 
 
 def bounded_exp(log_ratio: Steps) -> Steps:

@@ -21,10 +21,11 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ADAM, ActorCritic, ActorCriticOptions, adam_step, soft_update
+from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, soft_update
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops.networks import init_narrowed
+from sejax.ops.optimizers import ADAM
 from sejax.options import finite, fraction, not_negative, option, positive, require, shortened
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code

@@ -18,9 +18,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ADAM, ActorCritic, ActorCriticOptions, adam_step, soft_update
+from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, soft_update
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, init_narrowed
+from sejax.ops.optimizers import ADAM
 from sejax.options import MOVES, counts, fraction, not_negative, option, positive
 
 _MIN_TEMPERATURE = 1e-6
