@@ -1,14 +1,15 @@
 """Our SEs beside those of Liesen et al. (2024): the same students on both, like for like.
 
-synthetic-gymnax has SEs of one step, as sejax has: `reward([state, action])` in the state
-`initial_state(z)`. Agents of Stable-Baselines3, with the library's defaults and with RL Zoo's
-settings, and agents of sejax, with default and with random hyperparameters, train on their SEs and
-on those that ship here, and are tested on the real tasks. An agent of Stable-Baselines3 is tested
-on the way (`benchmarks/stock_agents.py`); one of sejax is trained for each number of steps anew,
-with the same keys. Their SEs of MuJoCo's tasks are of another physics, and are left out.
+synthetic-gymnax has SEs of one step, as sejax has: the reward of an action in the state
+`initial_state(z)`, of normal noise z. Agents of Stable-Baselines3, with the library's defaults and
+with RL Zoo's settings, and agents of sejax, with default and with random hyperparameters, train on
+their SEs and on those that ship here, and are tested on the real tasks. An agent of
+Stable-Baselines3 is tested on the way (`benchmarks/stock_agents.py`, which needs `pip install
+'sejax[bench]'`); one of sejax is trained for each number of steps anew, with the same keys. Their
+SEs of MuJoCo's tasks are of another physics, and are left out.
 
-Their weights are not here: `theirs` is a folder with a file for each task, `cartpole.npz`, of their
-checkpoint's arrays by name, `params/reward/Dense_0/kernel`.
+Their weights are not stored here: `theirs` is a folder with the arrays of each checkpoint as
+`cartpole.npz`, by names like `params/reward/Dense_0/kernel`.
 """
 
 import importlib
@@ -31,7 +32,6 @@ from experiments.common.shards import stack, unstack
 from sejax import Task, envs
 from sejax.options import each_of, require
 
-OURS, THEIRS = "ours", "theirs"
 BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
 STOCK = {True: ("ppo", "a2c", "dqn"), False: ("ppo", "a2c", "sac", "td3")}  # for discrete actions
 STUDENTS = {
@@ -40,38 +40,38 @@ STUDENTS = {
     "sejax_default": "sejax, defaults",
     "sejax_varied": "sejax, random hyperparameters",
 }
-GROUP = 5  # agents that are computed together
+SES = {"ours": figures.FIXED, "theirs": figures.REAL}
+GROUP = 5  # agents of sejax that are computed together
+ALL = "all"  # algorithms
 
 
 class Published(NamedTuple):
-    """What synthetic-gymnax says of an SE, and what a generation of it takes.
+    """What learning an SE of synthetic-gymnax took.
 
     Attributes:
       file: stem of the file of its weights.
-      generations: `num_generations` in its configuration.
-      trainings: of a generation, each of 10,000 steps: the population's, and 64 on its mean with
-        each algorithm.
+      generations: of its configuration.
+      trainings: of a generation, of 10,000 steps each: one an SE of the population and, with each
+        algorithm, 64 on the search mean.
       real_steps: of the 50 test episodes after a training, at most.
-      cpu_s: of a generation on one core, estimated; docs/studies/peers.md says how.
+      cpu_s: of a generation on one core; docs/studies/peers.md says how it was estimated.
     """
 
     file: str
     generations: int
     trainings: int
     real_steps: int
-    cpu_s: float = np.nan
+    cpu_s: float
 
 
 # Source: synthetic_gymnax/checkpoints/*/config.yaml of https://github.com/keraJLi/synthetic-gymnax
-# at 43e6479.
+# at 43e6479. The limit of MountainCar's episodes falls from 1,000 to 200 steps: 600 on average.
 PUBLISHED = {
-    "cartpole_v1": Published("cartpole", 300, 128 + 3 * 64, 50 * 500),
-    "acrobot": Published("acrobot", 100, 128 + 3 * 64, 50 * 500),
-    "mountain_car": Published(
-        "mountaincar", 1000, 128 + 3 * 64, 50 * 600
-    ),  # the mean of a schedule
-    "mountain_car_continuous": Published("continuous_mountaincar", 300, 128 + 4 * 64, 50 * 999),
-    "pendulum": Published("pendulum", 1000, 8 * 64 + 4 * 64, 50 * 200),
+    "cartpole_v1": Published("cartpole", 300, 128 + 3 * 64, 50 * 500, 485),
+    "acrobot": Published("acrobot", 100, 128 + 3 * 64, 50 * 500, 0),
+    "mountain_car": Published("mountaincar", 1000, 128 + 3 * 64, 50 * 600, 0),
+    "mountain_car_continuous": Published("continuous_mountaincar", 300, 128 + 4 * 64, 50 * 999, 0),
+    "pendulum": Published("pendulum", 1000, 8 * 64 + 4 * 64, 50 * 200, 0),
 }
 
 
@@ -91,11 +91,15 @@ class Peers(Settings):
     name = "peers"
 
     theirs: str | None = setting(None)
-    tasks: tuple[str, ...] = setting(tuple(PUBLISHED), each_of(tuple(PUBLISHED)))
-    students: tuple[str, ...] = setting(tuple(STUDENTS), each_of(tuple(STUDENTS)))
+    tasks: tuple[str, ...] = setting(tuple(PUBLISHED), each_of(PUBLISHED))
+    students: tuple[str, ...] = setting(tuple(STUDENTS), each_of(STUDENTS))
     num_groups: int = count(4, quick=1)
     steps: tuple[int, ...] = setting((2000, 5000, 10_000), quick=(500,))
     finished: bool = setting(False)
+
+    def is_wanted(self, shard: str) -> bool:
+        """Whether a shard is to be read, or computed."""
+        return not self.finished or self.shards.path(shard).exists()
 
 
 def converted(path: Path, task: Task) -> tuple[Any, Any]:
@@ -107,98 +111,85 @@ def converted(path: Path, task: Task) -> tuple[Any, Any]:
     Raises:
       ConfigError: if there is no such file.
     """
-    require(path.is_file(), "theirs", f"must be a folder with {path.name}; got {path.parent}. "
-            "Set theirs=DIR.")  # fmt: skip
+    must = f"must be a folder with {path.name}; got {path.parent}. Set theirs=DIR."
+    require(path.is_file(), "theirs", must)
     with np.load(path) as stored:
         theirs = {name.removeprefix("params/"): x for name, x in stored.items()}
     noise = np.eye(task.obs_dim)
-    kernels = {
-        "reward/Dense_0": np.roll(theirs["reward/Dense_0/kernel"], task.action_dim, axis=0),
-        "reward/Dense_1": theirs["reward/Dense_1/kernel"],
-        "start/Dense_0": np.hstack([theirs["initial_state/Dense_0/kernel"], noise, -noise]),
-        "start/Dense_1": np.vstack([theirs["initial_state/Dense_1/kernel"], -noise, noise]),
+    first, start = theirs["reward/Dense_0/kernel"], theirs["initial_state/Dense_0/kernel"]
+    weights = {name: x.T for name, x in theirs.items() if name.startswith("reward")}
+    weights |= {
+        "reward/Dense_0/kernel": np.roll(first, task.action_dim, axis=0).T,  # actions come first
+        "start/Dense_0/kernel": np.hstack([start, noise, -noise]).T,
+        "start/Dense_0/bias": np.pad(theirs["initial_state/Dense_0/bias"], (0, 2 * len(noise))),
+        "start/Dense_1/kernel": np.vstack(
+            [theirs["initial_state/Dense_1/kernel"], -noise, noise]
+        ).T,
+        "start/Dense_1/bias": theirs["initial_state/Dense_1/bias"],
     }
-    biases = {
-        "reward/Dense_0": theirs["reward/Dense_0/bias"],
-        "reward/Dense_1": theirs["reward/Dense_1/bias"],
-        "start/Dense_0": np.pad(theirs["initial_state/Dense_0/bias"], (0, 2 * len(noise))),
-        "start/Dense_1": theirs["initial_state/Dense_1/bias"],
-    }
-    flat = {f"{layer}/kernel": kernel.T for layer, kernel in kernels.items()}
-    flat |= {f"{layer}/bias": bias for layer, bias in biases.items()}
-    env = sejax.SyntheticConfig(
-        hidden_size=len(biases["reward/Dense_0"]),
-        activation="relu",
-        start_hidden_size=len(biases["start/Dense_0"]),
-    ).make(task)
-    return env, unflatten_dict(flat, sep="/")
+    units = {"hidden_size": first.shape[1], "start_hidden_size": start.shape[1] + 2 * len(noise)}
+    env = sejax.SyntheticConfig(activation="relu", **units).make(task)
+    return env, unflatten_dict(weights, sep="/")
 
 
 def compute(settings: Peers) -> pd.DataFrame:
-    """Trains what is missing: a row for each agent and number of steps; and what SEs cost."""
-    require(settings.theirs, "theirs", "must be a folder; got none. Set theirs=DIR.")
-    found = []
+    """Trains what is missing: a row for each agent and number of steps, and one for each SE."""
+    students, costs = [], []
     for name in settings.tasks:
-        task = envs.make(name)
-        env, weights = converted(Path(str(settings.theirs), f"{PUBLISHED[name].file}.npz"), task)
+        task, published = envs.make(name), PUBLISHED[name]
         file = settings.work_folder / f"{name}.safetensors"
-        sejax.save(file, env, weights)
-        for students, (se, source) in itertools.product(
-            settings.students, {OURS: name, THEIRS: str(file)}.items()
+        sejax.save(file, *converted(Path(settings.theirs or "", f"{published.file}.npz"), task))
+        sources = dict(zip(SES, (name, str(file)), strict=True))
+        for sort, (se, source) in itertools.product(settings.students, sources.items()):
+            train = stock_students if sort.startswith("sb3") else our_students
+            tables = train(settings, task, sort, se, source)
+            students += [rows.assign(task=name, students=sort, se=se) for rows in tables]
+        trainings = published.generations * published.trainings
+        theirs = trainings * 10_000, trainings * published.real_steps
+        learned = shipped(name).learning
+        for se, steps, cpu_s in (
+            ("ours", (learned.train_steps, learned.real_steps), learned.cpu_s),
+            ("theirs", theirs, published.generations * published.cpu_s),
         ):
-            train = stock_students if students.startswith("sb3") else our_students
-            for rows in train(settings, task, students, se, source):
-                found.append(rows.assign(task=name, students=students, se=se))
-    costs = [costs_of(name, se) for name, se in itertools.product(settings.tasks, (OURS, THEIRS))]
-    return stack({"agents": pd.concat(found), "costs": pd.DataFrame(costs)})
+            cost = dict(zip(COSTS, (*steps, cpu_s / 3600), strict=True))
+            costs.append({"task": name, "se": se} | cost)
+    return stack({"students": pd.concat(students), "costs": pd.DataFrame(costs)})
 
 
-def costs_of(name: str, se: str) -> dict[str, Any]:
-    """What learning an SE took."""
-    if se == OURS:
-        learning = shipped(name).learning
-        steps, real, cpu_s = learning.train_steps, learning.real_steps, learning.cpu_s
-    else:
-        own = PUBLISHED[name]
-        trainings = own.generations * own.trainings
-        steps, real = trainings * 10_000, trainings * own.real_steps
-        cpu_s = own.generations * own.cpu_s
-    return {"task": name, "se": se, "se_steps": steps, "real_steps": real, "cpu_h": cpu_s / 3600}
+COSTS = ("se_steps", "real_steps", "cpu_hours")
 
 
 def stock_students(
-    settings: Peers, task: Task, students: str, se: str, source: str
+    settings: Peers, task: Task, sort: str, se: str, source: str
 ) -> Iterator[pd.DataFrame]:
     """Agents of Stable-Baselines3, a cached shard for each."""
     sys.path.append(BENCHMARKS)
     stock_agents = importlib.import_module("stock_agents")
     seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
     for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):
-        agent = kind.upper() if students == "sb3_defaults" else kind
-        tests = (max(settings.steps), 10, settings.steps)
+        agent = kind.upper() if sort == "sb3_defaults" else kind
+        tests = max(settings.steps), 10, settings.steps
         training = stock_agents.Training(source, task.name, agent, seed, *tests)
 
         def train(training: Any = training) -> pd.DataFrame:
             table = pd.DataFrame(stock_agents.run(training), columns=stock_agents.COLUMNS)
             return table.rename(columns={"mean_return": "test_return"})[["steps", "test_return"]]
 
-        name = f"{task.name}-{se}-{students}-{kind}-{seed}"
-        if not settings.finished or settings.shards.path(name).exists():
+        shard = f"{task.name}-{se}-{sort}-{kind}-{seed}"
+        if settings.is_wanted(shard):
             depends = training._asdict() | {"world": se}
-            yield settings.shards.compute(name, depends, train).assign(kind=kind, seed=seed)
+            yield settings.shards.compute(shard, depends, train).assign(kind=kind, seed=seed)
 
 
 def our_students(
-    settings: Peers, task: Task, students: str, se: str, source: str
+    settings: Peers, task: Task, sort: str, se: str, source: str
 ) -> Iterator[pd.DataFrame]:
-    """Agents of sejax, a cached shard for each five and each number of steps."""
+    """Agents of sejax, a cached shard for each group and number of steps."""
     proxy = sejax.load_proxy(source)
-    kinds = agents.DISCRETE if task.num_actions is not None else agents.CONTINUOUS
+    kinds = agents.CONTINUOUS if task.num_actions is None else agents.DISCRETE
     for kind, steps in itertools.product(kinds, settings.steps):
-        name = f"{task.name}-{se}-{students}-{kind}-{steps}"
-        groups = [str(i) for i in range(settings.num_groups)]
-        if settings.finished:
-            groups = [x for x in groups if settings.shards.path(f"{name}-{x}").exists()]
+        name = f"{task.name}-{se}-{sort}-{kind}-{steps}"
+        groups = [str(i) for i in range(settings.num_groups) if settings.is_wanted(f"{name}-{i}")]
         condition = Condition(
             name=name,
             env=proxy.env,
@@ -206,7 +197,7 @@ def our_students(
             groups=tuple(Group.of(group, proxy) for group in groups),
             agent=agents.agent_config(kind),
             training=sejax.TrainingConfig(max_steps=steps, max_episodes=steps),
-            hparams=students.removeprefix("sejax_"),
+            hparams=sort.removeprefix("sejax_"),
             settings={"se": se},
         )
         if groups:
@@ -220,88 +211,73 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 
     Columns begin with whose SEs they are of, and end with the steps: `ours_mean_2000`.
     """
-    students, costs = unstack(rows, "agents"), unstack(rows, "costs").set_index(["task", "se"])
+    students, costs = unstack(rows, "students"), unstack(rows, "costs").set_index(["task", "se"])
 
     def statistics(mine: pd.DataFrame) -> dict[str, Any]:
-        solved_reward = envs.make(mine["task"].iloc[0]).solved_reward
+        name = mine["task"].iloc[0]
         columns: dict[str, Any] = {}
         for (se, steps), returns in mine.groupby(["se", "steps"])["test_return"]:
-            measured = {
-                "num": len(returns),
-                "mean": returns.mean(),
-                "median": returns.median(),
-                "worst": returns.min(),
-                "solved": (returns >= solved_reward).mean(),
-            }
-            columns |= {f"{se}_{name}_{steps:.0f}": value for name, value in measured.items()}
-            columns |= {
-                f"{se}_{name}": x for name, x in costs.loc[mine["task"].iloc[0], se].items()
-            }
+            measured = returns.agg(["size", "mean", "median", "min"]).to_dict()
+            measured["solved"] = (returns >= envs.make(name).solved_reward).mean()
+            columns |= {f"{se}_{what}_{steps:.0f}": x for what, x in measured.items()}
+            columns |= {f"{se}_{what}": costs.loc[(name, se), what] for what in COSTS}
         return columns
 
-    each = pd.concat([students.assign(kind=ALL), students])
-    summary = tables.summary_by(each, ["task", "students", "kind"], statistics)
-    return summary.sort_values(["task", "students"], kind="stable", key=in_order)
-
-
-def in_order(column: pd.Series) -> pd.Series:
-    """The places of tasks and of sorts of students in this page."""
-    return column.map([*PUBLISHED, *STUDENTS].index)
+    both = pd.concat([students.assign(kind=ALL), students])
+    return tables.summary_by(both, ["task", "students", "kind"], statistics)
 
 
 def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(rows)
-    draw(settings, unstack(rows, "agents"))
-    fewer, most = settings.steps[:-1], settings.steps[-1]
+    draw(settings, unstack(rows, "students"))
     columns: dict[str, Any] = {
         "task": "{task}",
         "students": lambda row: STUDENTS[row.students],
-        "algorithm": lambda row: figures.agent_name(row.kind) if row.kind != ALL else ALL,
+        "algorithm": lambda row: row.kind if row.kind == ALL else figures.agent_name(row.kind),
     }
-    for se in (OURS, THEIRS):
-        columns[f"{se}: agents"] = f"{{{se}_num_{most}:.0f}}"
-        columns |= {f"mean after {steps:,}, {se}": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
-        columns[f"mean after {most:,} (median, worst; solved), {se}"] = (
-            f"{{{se}_mean_{most}:,.1f}} ({{{se}_median_{most}:,.1f}}, {{{se}_worst_{most}:,.1f}}; "
-            f"{{{se}_solved_{most}:.0%}})"
-        )
-    table = tables.as_texts(summary, columns)
+    *fewer, most = settings.steps
+    last = ("{{{0}_mean_{1}:,.1f}} ({{{0}_median_{1}:,.1f}}, {{{0}_min_{1}:,.1f}}; "
+            "{{{0}_solved_{1}:.0%}} of {{{0}_size_{1}:.0f}})")  # fmt: skip
+    for se in SES:
+        columns |= {f"{se}, {steps:,} steps": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
+        columns[f"{se}, {most:,} steps"] = last.format(se, most)
     note = (
-        "Scores: mean return of ten episodes of the real task after so many steps on the SE, over "
-        "agents. All: the agents of all algorithms together."
+        "Mean returns of agents after so many steps on the SE, in ten episodes of the real task; "
+        "after the most steps with median and worst agent, share that solves the task and number "
+        "of agents. All: the agents of all algorithms together."
     )
     title = "The same students on our SEs and on synthetic-gymnax's"
+    table = tables.as_texts(summary, columns)
     return tables.publish(settings, title, table, summary, note)
 
 
 def draw(settings: Peers, students: pd.DataFrame) -> None:
-    """Draws what every agent scores after most steps: a panel for each task."""
+    """Draws what every agent scores after the most steps, and the means: a panel for each task."""
     last = students[students["steps"] == students["steps"].max()]
-    names, colors = list(last["task"].unique()), {OURS: figures.FIXED, THEIRS: figures.REAL}
-    size = (1.0 + 2.4 * len(names), 3.2)
-    with figures.panels(settings.folder / "peers.png", 1, len(names), size) as (figure, axes):
-        for axis, name in zip(axes[0], names, strict=True):
+    tasks, places = list(last["task"].unique()), {sort: i for i, sort in enumerate(STUDENTS)}
+    size = (1.0 + 2.5 * len(tasks), 3.4)
+    with figures.panels(settings.folder / "peers.png", 1, len(tasks), size) as (figure, axes):
+        for axis, name in zip(axes[0], tasks, strict=True):
             here = last[last["task"] == name]
-            for (side, (se, color)), (place, sort) in itertools.product(
-                zip((-0.18, 0.18), colors.items(), strict=True), enumerate(STUDENTS)
-            ):
-                returns = here[(here["se"] == se) & (here["students"] == sort)]["test_return"]
-                spread = place + side + np.linspace(-0.12, 0.12, len(returns))
-                label = f"on {se}" if place == 0 else None
-                axis.plot(spread, returns, "o", ms=2.5, alpha=0.5, color=color, label=label)
-                if len(returns):
-                    axis.hlines(returns.mean(), place + side - 0.15, place + side + 0.15, color)
+            for shift, (se, color) in zip((-0.2, 0.2), SES.items(), strict=True):
+                mine = here[here["se"] == se].copy()
+                mine["place"] = mine["students"].map(places) + shift
+                jitter = 0.02 * (mine["seed"] % 11 - 5)
+                how: dict[str, Any] = {"color": color, "label": f"trained on {se}"}
+                axis.plot(
+                    mine["place"] + jitter, mine["test_return"], "o", ms=2.5, alpha=0.4, **how
+                )
+                axis.plot(
+                    mine.groupby("place")["test_return"].mean(), "_", ms=14, mew=2, color=color
+                )
             figures.threshold(axis, envs.make(name).solved_reward, "solved")
-            shown = [
-                text.replace(", ", "\n").replace(" hyper", "\nhyper") for text in STUDENTS.values()
-            ]
-            axis.set_xticks(range(len(STUDENTS)), shown, fontsize=7, rotation=40)
+            labels = [text.replace(", ", "\n") for text in STUDENTS.values()]
+            axis.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60)
             axis.set_title(name, fontsize=10)
         axes[0, 0].set_ylabel("score of an agent")
         figures.legend_above(figure, axes[0, 0])
 
 
-ALL = "all"
 EXPERIMENT = Experiment(settings=Peers, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":
