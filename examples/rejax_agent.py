@@ -18,28 +18,13 @@ import gymnax
 import jax
 import numpy as np
 import rejax
-from gymnax.environments.environment import Environment
 from jax import Array
 from rejax.evaluate import evaluate
 
 import sejax
+from sejax.envs import with_one_done
 
 MAX_STEPS = 200  # of CartPole
-
-
-class OneDone:
-    """An environment of gymnax 1.0 as rejax 0.1 knows them: `step` returns one `done`."""
-
-    def __init__(self, env: Environment):
-        self.env = env
-        self.default_params = env.default_params
-        self.reset = env.reset
-        self.action_space = env.action_space
-        self.observation_space = env.observation_space
-
-    def step(self, *args: Any) -> tuple[Array, Any, Array, Array, dict[Any, Any]]:
-        obs, state, reward, terminated, truncated, info = self.env.step(*args)
-        return obs, state, reward, terminated | truncated, info
 
 
 def main() -> None:
@@ -56,13 +41,13 @@ def main() -> None:
 
     def test_on_real(algorithm: rejax.DQN, state: Any, key: Array) -> Array:
         act = algorithm.make_act(state)
-        _, returns = evaluate(act, key, OneDone(real), real_params, args.episodes, MAX_STEPS)
+        _, returns = evaluate(act, key, with_one_done(real), real_params, args.episodes, MAX_STEPS)
         return returns.mean()
 
     keys = jax.random.split(jax.random.key(0), args.agents)
     for name, env, params in (("the SE", synthetic, weights), ("CartPole", real, real_params)):
         algorithm = rejax.DQN.create(
-            env=OneDone(env), env_params=params, total_timesteps=args.steps,
+            env=with_one_done(env), env_params=params, total_timesteps=args.steps,
             eval_freq=args.test_every, buffer_size=args.steps, fill_buffer=args.steps // 10,
             batch_size=64, learning_rate=1e-3, target_update_freq=50, polyak=0.0,
             exploration_fraction=0.5,

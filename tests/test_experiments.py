@@ -18,7 +18,7 @@ from support import random_like, refuse, refused, shapes_of
 
 import experiments
 import sejax
-from experiments import score_transforms
+from experiments import peers, score_transforms
 from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
@@ -45,6 +45,7 @@ TINY = {
     "test_episodes=1",
     "null_baselines": "sources=[by_hand,episodes,evolved] students=ddqn hparams=default policies=1 "
     "num_agents=2 num_evolved=2 steps=40 teacher_steps=60 num_states=16",
+    "peers": "theirs=PUBLISHED tasks=cartpole_v1 students=sejax_default steps=[30,60]",
     "rn_heatmap": RNS,
     "rn_objectives": f"{CURVES} objectives=[reward_threshold,auc]",
     "rn_performance": CURVES,
@@ -87,6 +88,18 @@ def se_file(tmp_path_factory):
     return save_ses(path, 1, "preset=soft", "training.max_steps=60")
 
 
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """Random weights in the layout of synthetic-gymnax's SE of CartPole; their file's folder."""
+    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("published")
+    layers = {"initial_state/Dense_0": (4, 3), "initial_state/Dense_1": (3, 4),
+              "reward/Dense_0": (6, 3), "reward/Dense_1": (3, 1)}  # fmt: skip
+    weights = {f"params/{layer}/kernel": rng.normal(size=size) for layer, size in layers.items()}
+    weights |= {f"params/{layer}/bias": rng.normal(size=n) for layer, (_, n) in layers.items()}
+    np.savez(folder / "cartpole.npz", **weights)
+    return folder
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     """Agents and steps that cost nothing."""
@@ -107,11 +120,12 @@ def refuse_to_compute(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_an_experiment_runs_and_resumes_and_remakes_its_report(
-    name, se_file, tmp_path, monkeypatch, tiny
+    name, se_file, published, tmp_path, monkeypatch, tiny
 ):
     """Each has a row in `TINY`; what is finished is not computed again."""
     page = module_of(name).EXPERIMENT
-    options = fields(TINY[name].replace("SE", se_file), out=str(tmp_path))
+    words = TINY[name].replace("SE", se_file).replace("PUBLISHED", str(published))
+    options = fields(words, out=str(tmp_path))
     settings = page.settings.of(**options)
     table = page.run(settings)
     assert settings.summary_file.exists() and settings.settings_file.exists()
@@ -144,6 +158,25 @@ def test_an_experiment_says_what_it_is_and_refuses_other_words(name, tmp_path, c
             main(f"out={tmp_path}", word)
         error = capsys.readouterr().err
         assert ended.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_an_se_of_synthetic_gymnax_as_one_of_sejax_is_the_same(published):
+    file, task, key = published / "cartpole.npz", sejax.envs.make("cartpole_v1"), jax.random.key(0)
+    theirs = np.load(file)
+
+    def network(name, x):
+        for layer in (f"params/{name}/Dense_0", f"params/{name}/Dense_1"):
+            x = np.maximum(x, 0) if layer.endswith("1") else x
+            x = x @ theirs[f"{layer}/kernel"] + theirs[f"{layer}/bias"]
+        return x
+
+    env, weights = peers.converted(file, task)
+    obs, state = env.reset_env(key, env.params(weights))
+    noise = jax.random.normal(key, (4,))
+    np.testing.assert_allclose(obs, network("initial_state", noise), atol=1e-5)
+    _, _, reward, terminated, _ = env.step_env(key, state, 1, env.params(weights))
+    np.testing.assert_allclose(reward, network("reward", np.array([*obs, 0, 1]))[0], rtol=1e-5)
+    assert terminated and refused(peers.converted, published / "acrobot.npz", task) == "theirs"
 
 
 def test_all_experiments_are_listed_and_nothing_else_is_a_command(capsys):

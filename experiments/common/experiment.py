@@ -25,7 +25,8 @@ from sejax.options.plain import from_plain, parsed
 from sejax.runs import commands, compose, runtime
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
-NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
+# Fields that no result depends on, and `run`.
+NOT_SHOWN = {"work", "devices", "from_rows", "run", "theirs", "finished"}
 
 
 def setting(default: Any, rule: Rule | None = None, *, quick: Any = None) -> Any:

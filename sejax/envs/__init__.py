@@ -4,10 +4,21 @@
 """
 
 from sejax.envs.base import Task, TaskConfig
+from sejax.envs.environment import with_one_done
 from sejax.envs.spec import Box, Discrete, TaskSpec
 from sejax.options import registry
 
-__all__ = ["Box", "Discrete", "Task", "TaskSpec", "make", "make_from", "names", "spec_of"]
+__all__ = [
+    "Box",
+    "Discrete",
+    "Task",
+    "TaskSpec",
+    "make",
+    "make_from",
+    "names",
+    "spec_of",
+    "with_one_done",
+]
 
 
 def names() -> list[str]:

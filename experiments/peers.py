@@ -1,0 +1,284 @@
+"""Our SEs beside those of Liesen et al. (2024): the same students on both, like for like.
+
+synthetic-gymnax has SEs of one step, as sejax has: the reward of an action in the state
+`initial_state(z)`, of normal noise z. Agents of Stable-Baselines3, with the library's defaults and
+with RL Zoo's settings, and agents of sejax, with default and with random hyperparameters, train on
+their SEs and on those that ship here, and are tested on the real tasks. An agent of
+Stable-Baselines3 is tested on the way (`benchmarks/stock_agents.py`, which needs `pip install
+'sejax[bench]'`); one of sejax is trained for each number of steps anew, with the same keys. Their
+SEs of MuJoCo's tasks are of another physics, and are left out.
+
+Their weights are not stored here: `theirs` is a folder with the arrays of each checkpoint as
+`cartpole.npz`, by names like `params/reward/Dense_0/kernel`.
+"""
+
+import importlib
+import itertools
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from flax.traverse_util import unflatten_dict
+
+import sejax
+from experiments.common import agents, figures, tables
+from experiments.common.agents import Condition, Group, shipped
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
+from sejax import Task, envs
+from sejax.options import each_of, require
+
+BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
+STOCK = {True: ("ppo", "a2c", "dqn"), False: ("ppo", "a2c", "sac", "td3")}  # for discrete actions
+STUDENTS = {
+    "sb3_defaults": "SB3, defaults",
+    "sb3_zoo": "SB3, RL Zoo's settings",
+    "sejax_default": "sejax, defaults",
+    "sejax_varied": "sejax, random hyperparameters",
+}
+SES = {"ours": figures.FIXED, "theirs": figures.REAL}
+GROUP = 5  # agents of sejax that are computed together
+ALL = "all"  # algorithms
+
+
+class Published(NamedTuple):
+    """What learning an SE of synthetic-gymnax took.
+
+    Attributes:
+      file: stem of the file of its weights.
+      generations: of its configuration.
+      trainings: of a generation, of 10,000 steps each: one an SE of the population and, with each
+        algorithm, 64 on the search mean.
+      real_steps: of the 50 test episodes after a training, at most.
+      cpu_s: of a generation on one core; docs/studies/peers.md says how it was estimated.
+    """
+
+    file: str
+    generations: int
+    trainings: int
+    real_steps: int
+    cpu_s: float
+
+
+# Source: synthetic_gymnax/checkpoints/*/config.yaml of https://github.com/keraJLi/synthetic-gymnax
+# at 43e6479. The limit of MountainCar's episodes falls from 1,000 to 200 steps: 600 on average.
+PUBLISHED = {
+    "cartpole_v1": Published("cartpole", 300, 128 + 3 * 64, 50 * 500, 485),
+    "acrobot": Published("acrobot", 100, 128 + 3 * 64, 50 * 500, 0),
+    "mountain_car": Published("mountaincar", 1000, 128 + 3 * 64, 50 * 600, 0),
+    "mountain_car_continuous": Published("continuous_mountaincar", 300, 128 + 4 * 64, 50 * 999, 0),
+    "pendulum": Published("pendulum", 1000, 8 * 64 + 4 * 64, 50 * 200, 0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Peers(Settings):
+    """Settings of this experiment.
+
+    Attributes:
+      theirs: folder of synthetic-gymnax's weights
+      tasks: tasks of the SEs
+      students: agents that learn on them
+      num_groups: groups of five agents of each algorithm
+      steps: of a training, after which agents are tested
+      finished: Report what is finished, and train nothing.
+    """
+
+    name = "peers"
+
+    theirs: str | None = setting(None)
+    tasks: tuple[str, ...] = setting(tuple(PUBLISHED), each_of(PUBLISHED))
+    students: tuple[str, ...] = setting(tuple(STUDENTS), each_of(STUDENTS))
+    num_groups: int = count(4, quick=1)
+    steps: tuple[int, ...] = setting((2000, 5000, 10_000), quick=(500,))
+    finished: bool = setting(False)
+
+    def is_wanted(self, shard: str) -> bool:
+        """Whether a shard is to be read, or computed."""
+        return not self.finished or self.shards.path(shard).exists()
+
+
+def converted(path: Path, task: Task) -> tuple[Any, Any]:
+    """The SE of synthetic-gymnax's weights as one of sejax: `(env, weights)`, equal up to rounding.
+
+    sejax adds the noise z to the output of the network of initial states: units of relu(z) and
+    relu(-z) take it off again.
+
+    Raises:
+      ConfigError: if there is no such file.
+    """
+    must = f"must be a folder with {path.name}; got {path.parent}. Set theirs=DIR."
+    require(path.is_file(), "theirs", must)
+    with np.load(path) as stored:
+        theirs = {name.removeprefix("params/"): x for name, x in stored.items()}
+    noise = np.eye(task.obs_dim)
+    first, start = theirs["reward/Dense_0/kernel"], theirs["initial_state/Dense_0/kernel"]
+    weights = {name: x.T for name, x in theirs.items() if name.startswith("reward")}
+    weights |= {
+        "reward/Dense_0/kernel": np.roll(first, task.action_dim, axis=0).T,  # actions come first
+        "start/Dense_0/kernel": np.hstack([start, noise, -noise]).T,
+        "start/Dense_0/bias": np.pad(theirs["initial_state/Dense_0/bias"], (0, 2 * len(noise))),
+        "start/Dense_1/kernel": np.vstack(
+            [theirs["initial_state/Dense_1/kernel"], -noise, noise]
+        ).T,
+        "start/Dense_1/bias": theirs["initial_state/Dense_1/bias"],
+    }
+    units = {"hidden_size": first.shape[1], "start_hidden_size": start.shape[1] + 2 * len(noise)}
+    env = sejax.SyntheticConfig(activation="relu", **units).make(task)
+    return env, unflatten_dict(weights, sep="/")
+
+
+def compute(settings: Peers) -> pd.DataFrame:
+    """Trains what is missing: a row for each agent and number of steps, and one for each SE."""
+    students, costs = [], []
+    for name in settings.tasks:
+        task, published = envs.make(name), PUBLISHED[name]
+        file = settings.work_folder / f"{name}.safetensors"
+        sejax.save(file, *converted(Path(settings.theirs or "", f"{published.file}.npz"), task))
+        sources = dict(zip(SES, (name, str(file)), strict=True))
+        for sort, (se, source) in itertools.product(settings.students, sources.items()):
+            train = stock_students if sort.startswith("sb3") else our_students
+            tables = train(settings, task, sort, se, source)
+            students += [rows.assign(task=name, students=sort, se=se) for rows in tables]
+        trainings = published.generations * published.trainings
+        theirs = trainings * 10_000, trainings * published.real_steps
+        learned = shipped(name).learning
+        for se, steps, cpu_s in (
+            ("ours", (learned.train_steps, learned.real_steps), learned.cpu_s),
+            ("theirs", theirs, published.generations * published.cpu_s),
+        ):
+            cost = dict(zip(COSTS, (*steps, cpu_s / 3600), strict=True))
+            costs.append({"task": name, "se": se} | cost)
+    return stack({"students": pd.concat(students), "costs": pd.DataFrame(costs)})
+
+
+COSTS = ("se_steps", "real_steps", "cpu_hours")
+
+
+def stock_students(
+    settings: Peers, task: Task, sort: str, se: str, source: str
+) -> Iterator[pd.DataFrame]:
+    """Agents of Stable-Baselines3, a cached shard for each."""
+    sys.path.append(BENCHMARKS)
+    stock_agents = importlib.import_module("stock_agents")
+    seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
+    for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):
+        agent = kind.upper() if sort == "sb3_defaults" else kind
+        tests = max(settings.steps), 10, settings.steps
+        training = stock_agents.Training(source, task.name, agent, seed, *tests)
+
+        def train(training: Any = training) -> pd.DataFrame:
+            table = pd.DataFrame(stock_agents.run(training), columns=stock_agents.COLUMNS)
+            return table.rename(columns={"mean_return": "test_return"})[["steps", "test_return"]]
+
+        shard = f"{task.name}-{se}-{sort}-{kind}-{seed}"
+        if settings.is_wanted(shard):
+            depends = training._asdict() | {"world": se}
+            yield settings.shards.compute(shard, depends, train).assign(kind=kind, seed=seed)
+
+
+def our_students(
+    settings: Peers, task: Task, sort: str, se: str, source: str
+) -> Iterator[pd.DataFrame]:
+    """Agents of sejax, a cached shard for each group and number of steps."""
+    proxy = sejax.load_proxy(source)
+    kinds = agents.CONTINUOUS if task.num_actions is None else agents.DISCRETE
+    for kind, steps in itertools.product(kinds, settings.steps):
+        name = f"{task.name}-{se}-{sort}-{kind}-{steps}"
+        groups = [str(i) for i in range(settings.num_groups) if settings.is_wanted(f"{name}-{i}")]
+        condition = Condition(
+            name=name,
+            env=proxy.env,
+            task=task,
+            groups=tuple(Group.of(group, proxy) for group in groups),
+            agent=agents.agent_config(kind),
+            training=sejax.TrainingConfig(max_steps=steps, max_episodes=steps),
+            hparams=sort.removeprefix("sejax_"),
+            settings={"se": se},
+        )
+        if groups:
+            rows = agents.train_groups(condition, settings, GROUP)
+            seeds = settings.seed + GROUP * rows["group"].astype(int) + rows["agent"]
+            yield rows[["test_return"]].assign(seed=seeds, steps=steps, kind=kind)
+
+
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each task, sort of students and algorithm, and for all algorithms of a sort.
+
+    Columns begin with whose SEs they are of, and end with the steps: `ours_mean_2000`.
+    """
+    students, costs = unstack(rows, "students"), unstack(rows, "costs").set_index(["task", "se"])
+
+    def statistics(mine: pd.DataFrame) -> dict[str, Any]:
+        name = mine["task"].iloc[0]
+        columns: dict[str, Any] = {}
+        for (se, steps), returns in mine.groupby(["se", "steps"])["test_return"]:
+            measured = returns.agg(["size", "mean", "median", "min"]).to_dict()
+            measured["solved"] = (returns >= envs.make(name).solved_reward).mean()
+            columns |= {f"{se}_{what}_{steps:.0f}": x for what, x in measured.items()}
+            columns |= {f"{se}_{what}": costs.loc[(name, se), what] for what in COSTS}
+        return columns
+
+    both = pd.concat([students.assign(kind=ALL), students])
+    return tables.summary_by(both, ["task", "students", "kind"], statistics)
+
+
+def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
+    summary = summarise(rows)
+    draw(settings, unstack(rows, "students"))
+    columns: dict[str, Any] = {
+        "task": "{task}",
+        "students": lambda row: STUDENTS[row.students],
+        "algorithm": lambda row: row.kind if row.kind == ALL else figures.agent_name(row.kind),
+    }
+    *fewer, most = settings.steps
+    last = ("{{{0}_mean_{1}:,.1f}} ({{{0}_median_{1}:,.1f}}, {{{0}_min_{1}:,.1f}}; "
+            "{{{0}_solved_{1}:.0%}} of {{{0}_size_{1}:.0f}})")  # fmt: skip
+    for se in SES:
+        columns |= {f"{se}, {steps:,} steps": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
+        columns[f"{se}, {most:,} steps"] = last.format(se, most)
+    note = (
+        "Mean returns of agents after so many steps on the SE, in ten episodes of the real task; "
+        "after the most steps with median and worst agent, share that solves the task and number "
+        "of agents. All: the agents of all algorithms together."
+    )
+    title = "The same students on our SEs and on synthetic-gymnax's"
+    table = tables.as_texts(summary, columns)
+    return tables.publish(settings, title, table, summary, note)
+
+
+def draw(settings: Peers, students: pd.DataFrame) -> None:
+    """Draws what every agent scores after the most steps, and the means: a panel for each task."""
+    last = students[students["steps"] == students["steps"].max()]
+    tasks, places = list(last["task"].unique()), {sort: i for i, sort in enumerate(STUDENTS)}
+    size = (1.0 + 2.5 * len(tasks), 3.4)
+    with figures.panels(settings.folder / "peers.png", 1, len(tasks), size) as (figure, axes):
+        for axis, name in zip(axes[0], tasks, strict=True):
+            here = last[last["task"] == name]
+            for shift, (se, color) in zip((-0.2, 0.2), SES.items(), strict=True):
+                mine = here[here["se"] == se].copy()
+                mine["place"] = mine["students"].map(places) + shift
+                jitter = 0.02 * (mine["seed"] % 11 - 5)
+                how: dict[str, Any] = {"color": color, "label": f"trained on {se}"}
+                axis.plot(
+                    mine["place"] + jitter, mine["test_return"], "o", ms=2.5, alpha=0.4, **how
+                )
+                axis.plot(
+                    mine.groupby("place")["test_return"].mean(), "_", ms=14, mew=2, color=color
+                )
+            figures.threshold(axis, envs.make(name).solved_reward, "solved")
+            labels = [text.replace(", ", "\n") for text in STUDENTS.values()]
+            axis.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60)
+            axis.set_title(name, fontsize=10)
+        axes[0, 0].set_ylabel("score of an agent")
+        figures.legend_above(figure, axes[0, 0])
+
+
+EXPERIMENT = Experiment(settings=Peers, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()
