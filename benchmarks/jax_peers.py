@@ -1,0 +1,236 @@
+"""CPU time of an agent's step in JAX on one core: sejax against rejax.
+
+Networks, batches, buffers and numbers of updates are equal: two hidden layers, batches of 64, an
+update a step; PPO has one environment, rollouts of 128 steps, 4 minibatches and 10 epochs. Agents
+of both train as users of JAX train them: one after the other in `jax.lax.map`, or all at once in
+`jax.vmap`. Both are compiled with `sejax.compiler_options()`, kept to one core, and take turns;
+compilation is not in the time of a step and stands beside it.
+
+    pip install '.[examples]'
+    python benchmarks/jax_peers.py
+"""
+
+import argparse
+import itertools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import common
+
+ALGORITHMS = {  # the tasks on which each is measured
+    "ddqn": ("cartpole",),
+    "sac": ("cartpole", "pendulum"),
+    "td3": ("pendulum",),
+    "ppo": ("cartpole", "pendulum"),
+}
+WIDTHS = {64: 1024, 256: 256}  # units of a layer -> steps of a training
+PPO_STEPS = 128 * 16
+SIDES = ("sejax", "rejax")
+MODES = ("map", "vmap")
+GYMNAX_NAMES = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
+
+
+def main() -> None:
+    """Runs the benchmark, or one of its sides."""
+    args = common.parse_args(__doc__, add_options)
+    if args.side:
+        os.sched_setaffinity(0, {args.core})
+        serve(args.side, args)
+        return
+    cases = [
+        f"{algorithm} {width} {task}"
+        for algorithm, tasks in ALGORITHMS.items() for width in WIDTHS for task in tasks
+    ]  # fmt: skip
+    cases = args.cases or cases[: 1 if args.quick else None]
+    numbers = [1, 4] if args.quick else args.agents
+    machine = common.machine(("jax", "rejax", "sejax"))
+    rows = []
+    with common.sides_of(__file__, SIDES, core=args.core, seed=args.seed) as sides:
+        for case, world, agents, mode in itertools.product(cases, args.worlds, numbers, MODES):
+            request = {"case": case, "world": world, "agents": agents, "mode": mode}
+            answers = common.in_turns(sides, [request] * args.repeats)
+            row = request | {
+                f"{side}_us": common.spread([x["us"] for x in values])
+                for side, values in answers.items()
+            }
+            row |= {f"{side}_compile_s": values[0]["compile_s"] for side, values in answers.items()}
+            rows.append(row)
+            print(
+                *(f"{request[name]}" for name in request),
+                *(f"{side} {row[f'{side}_us']['median']:.1f}" for side in SIDES),
+                flush=True,
+            )
+    table = best_of_modes(rows)
+    common.print_table(
+        "CPU microseconds a step on one core, the better of map and vmap",
+        ["algorithm, units, task", "world", "agents", *SIDES, "rejax / sejax", "vmap / map"],
+        [[x["case"], x["world"], x["agents"], *(f"{x[side]:.1f}" for side in SIDES),
+          f"{x['ratio']:.2f}", f"{x['vmap_over_map']:.2f}"] for x in table],
+    )  # fmt: skip
+    if args.figure:
+        draw(table, args.figure, machine["cpu"])
+    common.finish("jax_peers", args, {"machine": machine, "rows": rows, "table": table})
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument("--cases", nargs="+", metavar="CASE", help="such as 'ddqn 64 cartpole'")
+    parser.add_argument("--worlds", nargs="+", choices=("task", "se"), default=["task", "se"])
+    parser.add_argument("--agents", nargs="+", type=int, default=[1, 16], help="in a program")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--figure", type=Path, metavar="PATH", help="draw the table there")
+    common.add_core(parser)
+
+
+def best_of_modes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """For each case, world and number of agents each side's better time and their ratio."""
+    table = []
+    for by_map, by_vmap in zip(rows[::2], rows[1::2], strict=True):
+        times = {side: [row[f"{side}_us"]["median"] for row in (by_map, by_vmap)] for side in SIDES}
+        best = {side: min(values) for side, values in times.items()}
+        mapped, vmapped = times["sejax"]
+        row = {name: by_map[name] for name in ("case", "world", "agents")}
+        ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": vmapped / mapped}
+        table.append(row | best | ratios)
+    return table
+
+
+def draw(table: list[dict[str, Any]], path: Path, cpu: str) -> None:
+    """Bars of both sides, a group for each case on the task with most agents."""
+    import matplotlib.pyplot as plt
+
+    most = max(row["agents"] for row in table)
+    shown = [row for row in table if row["agents"] == most and row["world"] == table[0]["world"]]
+    figure, axes = plt.subplots(figsize=(7, 0.4 * len(shown) + 1.2), layout="constrained")
+    for offset, side in ((-0.2, "sejax"), (0.2, "rejax")):
+        places = [i + offset for i in range(len(shown))]
+        axes.barh(places, [row[side] for row in shown], 0.4, label=side)
+    axes.set_yticks(range(len(shown)), [row["case"] for row in shown])
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel=f"CPU microseconds a step, one core of an {cpu}")
+    axes.legend()
+    figure.savefig(path)
+
+
+def serve(side: str, args: argparse.Namespace) -> None:
+    """A side: compiles what it is asked for the first time, and trains."""
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    import jax
+
+    import sejax
+
+    programs: dict[tuple[str, ...], tuple[Any, int, float]] = {}
+
+    def keys(agents: int) -> Any:
+        return jax.random.split(jax.random.key(args.seed), agents)
+
+    def compiled(case: str, world: str, agents: int, mode: str) -> tuple[Any, int, float]:
+        algorithm, width, task = case.split()
+        steps = PPO_STEPS if algorithm == "ppo" else WIDTHS[int(width)]
+        train = TRAINERS[side](algorithm, int(width), task, world, steps)
+        fn = jax.vmap(train) if mode == "vmap" else lambda keys: jax.lax.map(train, keys)
+        lowered = jax.jit(fn).lower(keys(agents))
+        program, times = common.measure(lambda: lowered.compile(sejax.compiler_options()))
+        return program, steps, times["wall_s"]
+
+    def handle(request: dict[str, Any]) -> dict[str, Any]:
+        name = tuple(map(str, request.values()))
+        if name not in programs:
+            programs.clear()
+            programs[name] = compiled(**request)
+        program, steps, compile_s = programs[name]
+        inputs = keys(request["agents"])
+        _, times = common.measure(lambda: jax.block_until_ready(program(inputs)))
+        return {"us": 1e6 * times["cpu_s"] / (steps * request["agents"]), "compile_s": compile_s}
+
+    common.serve({}, handle)
+
+
+def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
+    """The task, and the environment with its parameters: the task's own, or a fresh SE's."""
+    import jax
+
+    import sejax
+
+    task = sejax.envs.make(task_name)
+    if world == "task":
+        return task, task.env, task.params
+    env = sejax.SyntheticConfig(initial_state="real", horizon=None, done="soft").make(task)
+    return task, env, env.params(env.init_weights(jax.random.key(0)))
+
+
+def sejax_trainer(
+    algorithm: str, width: int, task_name: str, world: str, steps: int
+) -> Callable[[Any], Any]:
+    """`key -> trained agent`."""
+    import sejax
+
+    task, env, params = world_of(task_name, world)
+    network: dict[str, Any] = {"hidden_size": width, "num_layers": 2}
+    if algorithm == "ppo":
+        rollouts = {"rollout_steps": 128, "num_minibatches": 4, "epochs": 10}
+        config: Any = sejax.PPOConfig(**network, **rollouts, activation="tanh")
+    else:
+        network |= {"batch_size": 64, "buffer_size": steps, "warmup_episodes": 0}
+        configs = {"ddqn": sejax.DDQNConfig, "sac": sejax.SACConfig, "td3": sejax.TD3Config}
+        config = configs[algorithm](**network, activation="relu")
+    agent = sejax.make_agent(config, task)
+    training = sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
+    train = sejax.make_trainer(agent, env, training)
+    return lambda key: train(key, params).agent_state
+
+
+def rejax_trainer(
+    algorithm: str, width: int, task_name: str, world: str, steps: int
+) -> Callable[[Any], Any]:
+    """`key -> parameters of the networks`."""
+    import jax.numpy as jnp
+    import rejax
+    from flax import linen as nn
+    from rejax import networks
+
+    from sejax.envs import with_one_done
+
+    if world == "task":
+        import gymnax
+
+        env, params = gymnax.make(GYMNAX_NAMES[task_name])
+    else:
+        _, env, params = world_of(task_name, world)
+    common_settings = {
+        "env": with_one_done(env), "env_params": params, "total_timesteps": steps,
+        "eval_freq": steps, "skip_initial_evaluation": True, "learning_rate": 1e-3, "num_envs": 1,
+    }  # fmt: skip
+    replay = {"buffer_size": steps, "fill_buffer": 1, "batch_size": 64, "num_epochs": 1}
+    layers, layout = (width, width), {"hidden_layer_sizes": (width, width), "activation": nn.relu}
+    if algorithm == "ppo":
+        agent: Any = rejax.PPO.create(
+            **common_settings, num_steps=128, num_minibatches=4, num_epochs=10,
+            agent_kwargs={"activation": "tanh", "hidden_layer_sizes": layers},
+        )  # fmt: skip
+    elif algorithm == "sac":
+        agent = rejax.SAC.create(**common_settings, **replay, hidden_layer_sizes=layers)
+    elif algorithm == "ddqn":
+        q_network = networks.EpsilonGreedyPolicy(networks.DiscreteQNetwork)
+        agent = rejax.DQN.create(**common_settings, **replay)
+        agent = agent.replace(agent=q_network(action_dim=2, **layout))
+    else:
+        agent = rejax.TD3.create(**common_settings, **replay)
+        bounds = agent.env.action_space(params)
+        actor = networks.DeterministicPolicy(1, (bounds.low, bounds.high), **layout)
+        agent = agent.replace(actor=actor, critic=networks.QNetwork(**layout))
+    agent = agent.replace(eval_callback=lambda *_: jnp.zeros(()))
+
+    def train(key: Any) -> Any:
+        state, _ = agent.train(key)
+        return {name: x for name, x in vars(state).items() if name.endswith("_ts")}
+
+    return train
+
+
+TRAINERS = {"sejax": sejax_trainer, "rejax": rejax_trainer}
+
+if __name__ == "__main__":
+    main()
