@@ -170,7 +170,7 @@ def sejax_trainer(
     task, env, params = world_of(task_name, world)
     network: dict[str, Any] = {"hidden_size": width, "num_layers": 2}
     if algorithm == "ppo":
-        rollouts = {"rollout_steps": 128, "num_minibatches": 4, "epochs": 10}
+        rollouts: dict[str, Any] = {"rollout_steps": 128, "num_minibatches": 4, "epochs": 10}
         config: Any = sejax.PPOConfig(**network, **rollouts, activation="tanh")
     else:
         network |= {"batch_size": 64, "buffer_size": steps, "warmup_episodes": 0}

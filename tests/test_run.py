@@ -73,8 +73,9 @@ def uninterrupted(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_agents_with_networks_learn_the_same_on_any_number_of_devices(tmp_path):
-    words = "env=cartpole", "es.population_size=8", "generations=2"
+@pytest.mark.parametrize("agent", ["ddqn", "ppo"])
+def test_agents_with_networks_learn_the_same_on_any_number_of_devices(tmp_path, agent):
+    words = "env=cartpole", f"agent={agent}", "es.population_size=8", "generations=2"
     for devices in "12":
         command = sys.executable, "-m", "sejax.run", *words, f"devices={devices}"
         subprocess.run([*command, f"run_dir={tmp_path / devices}"], check=True)
