@@ -10,6 +10,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 Params = TypeVar("Params")  # a pytree
@@ -44,11 +45,13 @@ def scale_by_adam(eps: float = 1e-8) -> optax.GradientTransformation:
 def clip_by_global_norm(max_norm: float) -> optax.GradientTransformation:
     """The gradient, no longer than `max_norm`.
 
-    Plain form: `optax.clip_by_global_norm(max_norm)`.
+    Plain form: `optax.clip_by_global_norm(max_norm)`, which sums the squares of each array apart:
+    eleven kernels more on a GPU for PPO's two networks.
     """
 
     def clip(gradient: optax.Updates, params: optax.Params | None) -> optax.Updates:
-        scale = jnp.minimum(1.0, max_norm / optax.tree.norm(gradient))
+        vector, _ = ravel_pytree(gradient)
+        scale = jnp.minimum(1.0, max_norm / jnp.linalg.norm(vector))
         return jax.tree.map(lambda x: x * scale, gradient)
 
     return optax.stateless(clip)
