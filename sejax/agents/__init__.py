@@ -26,7 +26,7 @@ from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
 from sejax.options import registry, require, shortened
-from sejax.options.parts import require_part
+from sejax.options.registry import require_part
 
 DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
 

@@ -268,17 +268,6 @@ def as_python(value: Any) -> Any:
 # --- rules ---------------------------------------------------------------------------------------
 
 
-def rule(holds: Callable[[T], bool], must: str, reason: str) -> Rule[T]:
-    """The rule that a predicate holds; see `require`."""
-
-    def apply(name: str, value: T, default: T | None) -> None:
-        if not holds(value):
-            got, fix = shortened(value), f"{name}={as_text(default)}"
-            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
-
-    return apply
-
-
 def as_text(value: object) -> str:
     """A value as the command line takes it.
 
@@ -294,16 +283,24 @@ def as_text(value: object) -> str:
     return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
 
 
-def between(low: float, high: float, reason: str, must: str = "") -> Rule[float]:
-    """A number from `low` to `high`."""
+def between(
+    low: float, high: float, reason: str, must: str = "", is_whole: bool = False
+) -> Rule[float]:
+    """A number from `low` to `high`, and a whole one with `is_whole`."""
     must = must or f"lie between {low:g} and {high:g}"
-    return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
+
+    def apply(name: str, value: float, default: float | None) -> None:
+        is_within = is_number(value) and low <= value <= high
+        if not is_within or (is_whole and value != value // 1):
+            got, fix = shortened(value), f"{name}={as_text(default)}"
+            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
+
+    return apply
 
 
 def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule[float]:
     """A whole number from `least` to `most`."""
-    must = f"be a whole number from {least} to {most}"
-    return rule(lambda x: is_number(x) and least <= x <= most and x == x // 1, must, reason)
+    return between(least, most, reason, f"be a whole number from {least} to {most}", is_whole=True)
 
 
 def not_negative(reason: str = "it is a size") -> Rule[float]:

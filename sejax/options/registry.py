@@ -28,22 +28,37 @@ may be is in `sejax.options.plain`.
 import copy
 import dataclasses
 import functools
-import importlib
 import importlib.metadata
 import importlib.util
 import inspect
-import operator
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Callable, Collection, Mapping
+from pkgutil import resolve_name
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_checkable
 
 from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
-if TYPE_CHECKING:
-    from sejax.options.parts import Makes
-
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+@runtime_checkable
+class Makes(Protocol[T_co]):
+    """A configuration that makes a part, of a task or of whatever such a part is for."""
+
+    @property
+    def make(self) -> Callable[..., T_co]: ...
+
+
+@runtime_checkable
+class RunConfig(Protocol):
+    """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
+
+    @property
+    def generations(self) -> int: ...
+
+    def parts(self) -> dict[str, Any]: ...
 
 
 class Group(NamedTuple):
@@ -166,38 +181,26 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
         attribute that is no plugin.
     """
     if name in BUILT_IN[group]:
-        return _attribute(BUILT_IN[group][name])
+        return resolve_name(BUILT_IN[group][name])
     path = _path_of(group, name)
-    if path is None and ":" in name:
-        path = name
-        require_typed(group, path, imports)
-    if path is None:
+    if path is None and ":" not in name:
         raise unknown_name(group, name, [*names(group), *_meant(name)])
-    cls = _as_dataclass(group, name, imported(group, path))
+    if path is None:
+        require_typed(group, name, imports)
+    cls = _as_dataclass(group, name, imported(group, path or name))
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name
     return cls
 
 
-def name_of(group: str, config: "Makes[Any]") -> str:
+def name_of(group: str, config: Makes[Any]) -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
-    if _is_one_of_many(cls):
+    if "name" in getattr(cls, "__dataclass_fields__", ()):  # the class has a family of names
         return str(config.name)  # type: ignore[attr-defined]
     path = f"{cls.__module__}:{cls.__qualname__}"
     built_in = {path: name for name, path in BUILT_IN[group].items()}
     return _NAMES.get(cls) or built_in.get(path, path)
-
-
-def paths_in(words: Iterable[str]) -> list[str]:
-    """Each `module:attribute` in words.
-
-    Example:
-      >>> paths_in(["env=mine:Room", "agents=[ddqn,mine:A]", "proxy=hf://me/se", "storage=x://a:b@c"])
-      ['mine:Room', 'mine:A']
-    """
-    path = r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])"
-    return [match for word in words for match in re.findall(path, word)]
 
 
 _NAMES: dict[type, str] = {}  # of classes that were found by another name than their path
@@ -215,11 +218,6 @@ def _path_of(group: str, name: str) -> str | None:
     prefixes = PREFIXES if group == "env" else {}
     by_prefix = (path for start, path in prefixes.items() if name.startswith(start))
     return (BUILT_IN[group] | _offered(group)).get(name) or next(by_prefix, None)
-
-
-def _is_one_of_many(cls: type) -> bool:
-    """Whether a class has a family of names, so that the name is one of its fields."""
-    return dataclasses.is_dataclass(cls) and "name" in fields_of(cls)
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -244,8 +242,8 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
     require(is_choice, group, message)
     cls = find(group, values["name"], imports)
-    fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
     known = fields_of(cls)
+    fields = {k: v for k, v in values.items() if k != "name" or k in known}
     for field in [name for name in fields if name not in known]:
         others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
         message = f"is a field of {group}={', '.join(others)}. Set one of them."
@@ -253,30 +251,40 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     return from_plain(cls, fields, group, imports)
 
 
-def describe(group: str, config: "Makes[Any]") -> dict[str, Any]:
+def describe(group: str, config: Makes[Any]) -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
 
 
-def make(group: str, config: "Makes[T]", *arguments: Any) -> T:
+@overload
+def make(group: str, config: Makes[T], *arguments: Any) -> T: ...
+@overload
+def make(group: str, config: T | Makes[T], *arguments: Any) -> T: ...
+def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     """What a configuration configures, built once for equal configurations and arguments.
 
     Compiled programs are cached by the identity of what they were built from, so that a new
     instance would compile again. A configuration that cannot be hashed is equal to itself alone.
 
+    Args:
+      group: one of `GROUPS`.
+      config: the configuration; or what it configures, which is returned.
+      *arguments: of `Makes.make`.
+
     Raises:
-      ConfigError: if it makes something of another kind, or cannot be made.
+      ConfigError: if it is neither, makes something of another kind, or cannot be made.
     """
+    cls = resolve_name(GROUPS[group].makes)
+    if isinstance(config, cls) or not isinstance(config, Makes):
+        return require_part(group, cls, config)
     key = (group, config if is_hashable(config) else id(config), *arguments)
-    if key in _PARTS:
-        part: T = _PARTS[key][1]
-    else:
-        part, cls = config.make(*arguments), _attribute(GROUPS[group].makes)
+    if key not in _PARTS:
+        part = config.make(*arguments)
         name = shortened(name_of(group, config))
         message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
         require(isinstance(part, cls), group, message)
         _PARTS[key] = config, part  # with config, its id stays its own
-    return part
+    return cast(T, _PARTS[key][1])
 
 
 _PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
@@ -291,7 +299,23 @@ def is_hashable(config: object) -> bool:
     return True
 
 
-def require_package(group: str, config: "Makes[Any]") -> None:
+def require_part(
+    group: str,
+    cls: type[T],
+    part: object,
+    fix: str = "Pass an object; sejax.config([...]) takes names.",
+) -> T:
+    """The part, if it is one of this class.
+
+    Raises:
+      ConfigError: for anything else.
+    """
+    got = shortened(repr(part))
+    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; got {got}. {fix}")
+    return cast(T, part)
+
+
+def require_package(group: str, config: Makes[Any]) -> None:
     """Checks that the package which a plugin names as its `package` is there; imports nothing.
 
     Raises:
@@ -304,11 +328,6 @@ def require_package(group: str, config: "Makes[Any]") -> None:
 
 
 # --- plugins -------------------------------------------------------------------------------------
-
-
-def _attribute(path: str) -> Any:
-    module, _, attribute = path.partition(":")
-    return operator.attrgetter(attribute)(importlib.import_module(module))
 
 
 def require_path(field: str, path: str) -> None:
@@ -339,7 +358,7 @@ def imported(field: str, path: str) -> Any:
     """
     require_path(field, path)
     try:
-        return _attribute(path)
+        return resolve_name(path)
     except Exception as error:
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
         got = shortened(path, 60)
@@ -349,7 +368,7 @@ def imported(field: str, path: str) -> Any:
 
 def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
-    base, arguments = _attribute(GROUPS[group].base), GROUPS[group].arguments
+    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
     if inspect.isfunction(plugin):
         return _from_function(group, name, plugin)
     is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
@@ -380,7 +399,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
         if not is_hashable(p.default):  # such as a list
             field = dataclasses.field(default_factory=functools.partial(copy.copy, p.default))
         fields.append((p.name, Any if p.annotation is p.empty else p.annotation, field))
-    base = _attribute(GROUPS[group].base)
+    base = resolve_name(GROUPS[group].base)
     bases = (base if issubclass(base, Options) else Options,)
     namespace = {"make": make, "__doc__": function.__doc__, "__module__": function.__module__}
     return dataclasses.make_dataclass(

@@ -1,14 +1,20 @@
 """From the words that a user types to nested plain values: the first half of `runs.config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts. `compose` finds the choice of every group (the given one, else what the task and the proxy
-suggest), and lays the layers on each other: the choices, the preset or what a stored proxy was
-learned with, and the words. Whether their names are fields of the choices shows when dataclasses
-are made of them.
+texts; `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
+every group (the given one, else what the task and the proxy suggest), and lays the layers on each
+other: the choices, the preset or what a stored proxy was learned with, and the words. Whether their
+names are fields of the choices shows when dataclasses are made of them.
+
+sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset: values,
+`with_agent`, `with_es` and `with_objective` for those that only hold with one of these, and `like`
+for a section that it builds on, of its file or of `bases.yaml`. `general-<proxy>.yaml` serves tasks
+without a file of their own, and sections that say `like: general`. A user's file holds overrides.
 """
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import re
@@ -16,11 +22,22 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
+
 from sejax import agents, envs
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Options, as_text, registry, require, shortened
-from sejax.options.plain import expanded, merge, parsed, split, unquoted
-from sejax.runs import preset_files
+from sejax.options import (
+    ConfigError,
+    Options,
+    as_text,
+    listed,
+    registry,
+    require,
+    shortened,
+    told,
+    unknown_name,
+)
+from sejax.options.plain import expanded, flatten, merge, parsed, split, unquoted
 
 # Choices where neither a word nor the task or the proxy makes one.
 DEFAULTS = {
@@ -32,7 +49,15 @@ DEFAULTS = {
     "tracker": "none",
     "machines": "local",
 }
+AGENTS = ("agent", "agents")  # the fields that choose them
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
+# A choice may stand beside its fields, as in config.yaml.
+CHOICES = {f"{group}.name": group for group in registry.GROUPS}
+# sejax's own preset files, by their stems.
+PRESETS = {x.stem: x for x in sorted(Path(__file__).parents[1].glob("presets/*.yaml"))}
+BASES, GENERAL = "bases", "general"  # what sections build on; presets of tasks without a file
+# What reading a file of YAML may raise.
+UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
 Layers = dict[str, Mapping[str, Any]]
 Config = TypeVar("Config", bound=Options)
 
@@ -66,7 +91,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         message = "must be one value: brackets close and hold no space, and a comma outside of them"
         message += f" makes a sweep; got {shortened(text)}. Set {name}={fix}."
         require(not (others or is_open), name, message)
-        texts[name] = text
+        texts[CHOICES.get(name, name)] = text
     return texts
 
 
@@ -87,23 +112,22 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
       ConfigError: as `words`, and for a file that cannot be read.
     """
-    given: dict[str, Any] = {_choice(k): unquoted(text) for k, text in words(overrides).items()}
-    if not given.get("preset", "").endswith(preset_files.ENDING):
+    given: dict[str, Any] = {name: unquoted(text) for name, text in words(overrides).items()}
+    if not given.get("preset", "").endswith(".yaml"):
         return given
-    of_file = preset_files.read_file(Path(expanded(given.pop("preset"))))
+    path = Path(expanded(given.pop("preset")))
+    try:
+        flat = flatten(dict(yaml.safe_load(path.read_text(encoding="utf-8"))))
+    except UNREADABLE as error:
+        got = f"{shortened(path, 40)} ({told(error)})"
+        must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
+        raise ConfigError(must, "preset") from error
+    # An older run's config.yaml has null in the place of what it did not choose.
+    of_file = {CHOICES.get(k, k): x for k, x in flat.items() if k not in AGENTS or x is not None}
     if chosen := agents_of(given):  # in place of the file's
         others = tuple(f"agents.{key}." for key in agents_of(of_file) if key not in chosen)
-        choices = ("agent", "agents")
-        of_file = {
-            k: x for k, x in of_file.items() if k not in choices and not k.startswith(others)
-        }
-    return {_choice(k): x for k, x in of_file.items()} | given
-
-
-def _choice(name: str) -> str:
-    """The name of a field; a choice may stand beside its fields, as `env.name` in config.yaml."""
-    group = name.removesuffix(".name")
-    return group if group in registry.GROUPS else name
+        of_file = {k: x for k, x in of_file.items() if k not in AGENTS and not k.startswith(others)}
+    return of_file | given
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -168,8 +192,8 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in given]:
-        names = parsed(str(given[field]))
-        names = [*map(as_text, names if isinstance(names, list) else [names])]
+        value = parsed(str(given[field]))
+        names = [*map(as_text, value if isinstance(value, list) else [value])]
         several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
         is_clear = names and not chosen and len({*names}) == len(names)
         message = f"must name each agent once; got {shortened(given[field])}. Set agents="
@@ -180,13 +204,69 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
     return chosen | named
 
 
-def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
-    """The agent of the task that words choose."""
-    fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
-    task = fields | {"name": given.get("env", DEFAULTS["env"])}
-    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
-        return agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
-    return agents.DEFAULTS[0]
+# --- presets -------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _sections_in(stem: str) -> dict[str, dict[str, Any]]:
+    """The sections of one of sejax's own files, each with what it builds on merged in."""
+    general = f"{GENERAL}-{stem.rpartition('-')[2]}"
+    bases = {} if stem == BASES else _sections_in(BASES)
+    if stem not in (BASES, general):
+        bases = bases | {GENERAL: _sections_in(general)["best"]}
+    sections: dict[str, dict[str, Any]] = {}
+    for name, section in yaml.safe_load(PRESETS[stem].read_text(encoding="utf-8")).items():
+        like = section.pop("like", None)
+        sections[name] = merge({**bases, **sections}[like] if like else {}, section)
+    return sections
+
+
+def presets() -> list[str]:
+    """All presets that some file has."""
+    return sorted({name for stem in PRESETS if stem != BASES for name in _sections_in(stem)})
+
+
+def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+    """The presets of a task and proxy, by their names: its own, and what all tasks have."""
+    sections: dict[str, dict[str, Any]] = {"best": {}}
+    for stem in (f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
+        sections |= _sections_in(stem) if stem in PRESETS else {}
+    return sections
+
+
+def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
+    """What a preset says of a task and a proxy.
+
+    Raises:
+      ConfigError: for an unknown preset, or one that the task does not have.
+    """
+    sections = sections_of(env, proxy)
+    if preset not in sections and preset not in presets():
+        raise unknown_name("preset", preset, presets())
+    must = f"must be one that {shortened(env)} has ({listed(list(sections))}); got {preset}."
+    require(preset in sections, "preset", f"{must} Set preset=best.")
+    return sections[preset]
+
+
+def _settings_of(
+    section: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str]
+) -> dict[str, Any]:
+    """The settings of a preset's section for these choices, nested plain values.
+
+    Args:
+      section: as from `section_of`.
+      chosen: the choice of each group.
+      names: of the agents by their keys. What a section says of other groups beside an agent holds
+        where that is the only one.
+    """
+    with_agent = section.get("with_agent", {})
+    beside = {key: with_agent.get(name, {}) for key, name in names.items()}
+    layers = [{k: x for k, x in section.items() if not k.startswith("with_")}]
+    layers += [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
+    layers += beside.values() if len(beside) == 1 else []
+    agents_alone = {key: settings.get("agent", {}) for key, settings in beside.items()}
+    settings = merge(*layers, {"objective": {"name": chosen["objective"]}})
+    return {k: x for k, x in settings.items() if k != "agent"} | {"agents": agents_alone}
 
 
 # --- layers --------------------------------------------------------------------------------------
@@ -211,7 +291,10 @@ def compose(
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
     given = read(overrides)
-    imports = frozenset(registry.paths_in(overrides))
+    typed = [parsed(text) for text in words(overrides).values()]
+    imports = frozenset(
+        str(x) for value in typed for x in (value if isinstance(value, list) else [value])
+    )
     usual = DEFAULTS | {group: stored[group]["name"] for group in groups if group in stored}
     chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in groups}
     names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
@@ -220,11 +303,11 @@ def compose(
         names = {default: default}
     preset, of_preset = str(given.get("preset", "best")), {}
     if learns:
-        section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
+        section = section_of(preset, chosen["env"], chosen["proxy"])
         objective = registry.find("proxy", chosen["proxy"], imports).default_objective
         objective = section.get("objective", {}).get("name", objective)
         chosen["objective"] = given.get("objective", objective)
-        of_preset = {"preset": preset} | preset_files.settings_of(section, chosen, names)
+        of_preset = {"preset": preset} | _settings_of(section, chosen, names)
     choices = {group: {"name": name} for group, name in chosen.items()}
     layers = {
         "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
@@ -233,6 +316,15 @@ def compose(
         "typed": _nested(given, names, groups),
     }
     return layers, imports
+
+
+def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
+    """The agent of the task that words choose."""
+    fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
+    task = fields | {"name": given.get("env", DEFAULTS["env"])}
+    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
+        return agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
+    return agents.DEFAULTS[0]
 
 
 def _nested(

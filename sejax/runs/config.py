@@ -33,8 +33,7 @@ from sejax.options import (
 )
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
-from sejax.runs import preset_files
-from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, read
+from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, presets, read
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -405,7 +404,7 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if schema.learns:
-        lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
+        lines += [f"  preset: {', '.join([*presets(), 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
     classes += [(name, type(x)) for name, x in vars(config).items()]
