@@ -109,9 +109,9 @@ def offered(module, monkeypatch):
     ]
     offers = {"sejax.agents": points}
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: offers.get(group, []))
-    registry._offered.cache_clear()
+    registry._paths.cache_clear()
     yield name
-    registry._offered.cache_clear()
+    registry._paths.cache_clear()
 
 
 def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(offered):

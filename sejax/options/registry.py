@@ -160,7 +160,7 @@ PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymn
 
 def names(group: str) -> list[str]:
     """The registered names: those that come with sejax, then those of installed packages."""
-    return [*BUILT_IN[group], *_offered(group)]
+    return [*_paths(group)]
 
 
 def is_registered(group: str, name: str) -> bool:
@@ -207,17 +207,16 @@ _NAMES: dict[type, str] = {}  # of classes that were found by another name than 
 
 
 @functools.cache
-def _offered(group: str) -> dict[str, str]:
-    """Entry points of installed packages; a name of sejax's own cannot be taken over."""
+def _paths(group: str) -> dict[str, str]:
+    """The `module:attribute` of each registered name; sejax's own cannot be taken over."""
     points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
-    return {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
+    return BUILT_IN[group] | {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
 
 
 def _path_of(group: str, name: str) -> str | None:
     """The `module:attribute` that a registered name stands for."""
-    prefixes = PREFIXES if group == "env" else {}
-    by_prefix = (path for start, path in prefixes.items() if name.startswith(start))
-    return (BUILT_IN[group] | _offered(group)).get(name) or next(by_prefix, None)
+    by_prefix = PREFIXES.get(name[: name.find("/") + 1]) if group == "env" else None
+    return _paths(group).get(name, by_prefix)
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -232,7 +231,8 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
-      ConfigError: for an unknown name or field, or a value that cannot be.
+      ConfigError: for an unknown name or field, a value that cannot be, or a package that a plugin
+        names as its `package` and that is not installed.
 
     Example:
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
@@ -248,7 +248,12 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
         others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
         message = f"is a field of {group}={', '.join(others)}. Set one of them."
         require(not others, f"{group}.{field}", message)
-    return from_plain(cls, fields, group, imports)
+    config = from_plain(cls, fields, group, imports)
+    package = None if "package" in known else getattr(cls, "package", None)
+    is_there = package is None or importlib.util.find_spec(package) is not None
+    must = f"must be installed; got {values['name']} without the package {package}"
+    require(is_there, group, f"{must}. Install it with pip install 'sejax[{values['name']}]'.")
+    return config
 
 
 def describe(group: str, config: Makes[Any]) -> dict[str, Any]:
@@ -313,18 +318,6 @@ def require_part(
     got = shortened(repr(part))
     require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; got {got}. {fix}")
     return cast(T, part)
-
-
-def require_package(group: str, config: Makes[Any]) -> None:
-    """Checks that the package which a plugin names as its `package` is there; imports nothing.
-
-    Raises:
-      ConfigError: if it is not.
-    """
-    package, name = getattr(config, "package", None), name_of(group, config)
-    is_there = package is None or importlib.util.find_spec(package) is not None
-    message = f"must be installed; got {name} without the package {package}. Install it with pip"
-    require(is_there, group, f"{message} install 'sejax[{name}]'.")
 
 
 # --- plugins -------------------------------------------------------------------------------------

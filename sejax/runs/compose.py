@@ -234,39 +234,38 @@ def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def section_of(preset: str, env: str, proxy: str) -> dict[str, Any]:
-    """What a preset says of a task and a proxy.
+def _of_preset(
+    given: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str], objective: str
+) -> dict[str, Any]:
+    """The settings of a preset for these choices, nested plain values.
+
+    Args:
+      given: by the names of words.
+      chosen: the choice of each group.
+      names: of the agents by their keys. What a section says of other groups beside an agent holds
+        where that is the only one.
+      objective: where neither a word nor the preset chooses one.
 
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
-    sections = sections_of(env, proxy)
+    preset, sections = str(given.get("preset", "best")), sections_of(chosen["env"], chosen["proxy"])
     if preset not in sections and preset not in presets():
         raise unknown_name("preset", preset, presets())
-    must = f"must be one that {shortened(env)} has ({listed(list(sections))}); got {preset}."
-    require(preset in sections, "preset", f"{must} Set preset=best.")
-    return sections[preset]
-
-
-def _settings_of(
-    section: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str]
-) -> dict[str, Any]:
-    """The settings of a preset's section for these choices, nested plain values.
-
-    Args:
-      section: as from `section_of`.
-      chosen: the choice of each group.
-      names: of the agents by their keys. What a section says of other groups beside an agent holds
-        where that is the only one.
-    """
-    with_agent = section.get("with_agent", {})
-    beside = {key: with_agent.get(name, {}) for key, name in names.items()}
-    layers = [{k: x for k, x in section.items() if not k.startswith("with_")}]
-    layers += [section.get(f"with_{x}", {}).get(str(chosen[x]), {}) for x in ("es", "objective")]
-    layers += beside.values() if len(beside) == 1 else []
-    agents_alone = {key: settings.get("agent", {}) for key, settings in beside.items()}
-    settings = merge(*layers, {"objective": {"name": chosen["objective"]}})
-    return {k: x for k, x in settings.items() if k != "agent"} | {"agents": agents_alone}
+    must = f"must be one that {shortened(chosen['env'])} has ({listed(list(sections))})"
+    require(preset in sections, "preset", f"{must}; got {preset}. Set preset=best.")
+    section = sections[preset]
+    objective = given.get("objective", section.get("objective", {}).get("name", objective))
+    beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}
+    settings = merge(
+        {name: x for name, x in section.items() if not name.startswith("with_")},
+        section.get("with_es", {}).get(str(chosen["es"]), {}),
+        section.get("with_objective", {}).get(str(objective), {}),
+        *(beside.values() if len(beside) == 1 else ()),
+        {"objective": {"name": objective}, "preset": preset},
+    )
+    of_agents = {key: of_agent.get("agent", {}) for key, of_agent in beside.items()}
+    return {name: x for name, x in settings.items() if name != "agent"} | {"agents": of_agents}
 
 
 # --- layers --------------------------------------------------------------------------------------
@@ -285,61 +284,45 @@ def compose(
 
     Returns:
       The layers in the order in which one lies on another, nested plain values by where they come
-      from, and each `module:attribute` that the words name, which may be imported.
+      from, and what is typed: each `module:attribute` in it may be imported.
 
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given = read(overrides)
-    typed = [parsed(text) for text in words(overrides).values()]
-    imports = frozenset(
-        str(x) for value in typed for x in (value if isinstance(value, list) else [value])
-    )
-    usual = DEFAULTS | {group: stored[group]["name"] for group in groups if group in stored}
-    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in groups}
+    given, texts = read(overrides), words(overrides).values()
+    typed = frozenset(x.strip("[]'\" ") for text in texts for x in split(text.strip("[]")))
     names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
-        default = _default_agent(given, imports)
+        default = agents.DEFAULTS[0]
+        task = {name[4:]: x for name, x in given.items() if name.startswith("env.")}
+        task["name"] = given.get("env", DEFAULTS["env"])
+        with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
+            default = agents.default_for(envs.spec_of(registry.configure("env", task, typed)))
         names = {default: default}
-    preset, of_preset = str(given.get("preset", "best")), {}
-    if learns:
-        section = section_of(preset, chosen["env"], chosen["proxy"])
-        objective = registry.find("proxy", chosen["proxy"], imports).default_objective
-        objective = section.get("objective", {}).get("name", objective)
-        chosen["objective"] = given.get("objective", objective)
-        of_preset = {"preset": preset} | _settings_of(section, chosen, names)
-    choices = {group: {"name": name} for group, name in chosen.items()}
-    layers = {
-        "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
-        f"preset={preset}": of_preset,
-        "proxy": stored,
-        "typed": _nested(given, names, groups),
+    chosen: dict[str, Any] = {group: given.get(group, DEFAULTS[group]) for group in groups}
+    layers: Layers = {
+        "default": {group: {"name": name} for group, name in chosen.items()}
+        | {"agents": {key: {"name": name} for key, name in names.items()}}
     }
-    return layers, imports
-
-
-def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
-    """The agent of the task that words choose."""
-    fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
-    task = fields | {"name": given.get("env", DEFAULTS["env"])}
-    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
-        return agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
-    return agents.DEFAULTS[0]
+    if learns:
+        objective = registry.find("proxy", chosen["proxy"], typed).default_objective
+        of_preset = _of_preset(given, chosen, names, objective)
+        layers[f"preset={of_preset['preset']}"] = of_preset
+    return layers | {"proxy": stored, "typed": _nested(given, names, groups)}, typed
 
 
 def _nested(
-    given: Mapping[str, Any], agents: Collection[str], groups: Collection[str]
+    given: Mapping[str, Any], keys: Collection[str], groups: Collection[str]
 ) -> dict[str, Any]:
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
     for name, value in given.items():
-        group, _, field = name.partition(".")
-        if name in (*groups, "agent", "agents"):
+        if name in (*groups, *AGENTS):
             continue
+        group, _, field = name.partition(".")
         if group == "agent":
-            full, got = f"agents.{next(iter(agents))}.{field}", shortened(value)
-            is_clear = len(agents) == 1
-            require(is_clear, name, f"must be one agent's; got {got}. Set {full}={got}.")
+            full, got = f"agents.{next(iter(keys))}.{field}", shortened(value)
+            require(len(keys) == 1, name, f"must be one agent's; got {got}. Set {full}={got}.")
             name = full
         for part in reversed(name.split(".")):
             value = {part: value}

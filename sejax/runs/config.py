@@ -179,8 +179,6 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        registry.require_package("tracker", self.tracker)
-        registry.require_package("machines", self.machines)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
