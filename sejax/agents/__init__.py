@@ -84,7 +84,11 @@ _make_once = functools.cache(_make_agent)
 
 
 def require_fit(
-    agent: AgentConfig, exploration: ExplorationConfig, spec: TaskSpec, task_name: str
+    agent: AgentConfig,
+    exploration: ExplorationConfig,
+    spec: TaskSpec,
+    task_name: str,
+    field: str = "agent",
 ) -> None:
     """Checks that an agent can act in a task, and that it can explore so.
 
@@ -93,6 +97,7 @@ def require_fit(
       exploration: that of its intrinsic reward.
       spec: of the task.
       task_name: for messages.
+      field: of the agent, for messages.
 
     Raises:
       ConfigError: if it cannot.
@@ -104,7 +109,7 @@ def require_fit(
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
         require(
             False,
-            "agent",
+            field,
             f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
             f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
         )

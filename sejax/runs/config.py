@@ -93,15 +93,6 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
-    def require_fit(self, key: str, spec: TaskSpec, task_name: str) -> None:
-        """Checks that one of the agents can act in a task.
-
-        Raises:
-          ConfigError: if it cannot.
-        """
-        with errors_of("agent", field_of(key, self.agents)):
-            agents.require_fit(self.agents[key], self.exploration, spec, task_name)
-
     def require_learning(
         self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
     ) -> None:
@@ -187,8 +178,9 @@ class LearnConfig(CommandConfig):
         require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
-        for key in self.agents:
-            self.require_fit(key, spec, task_name)
+        for key, agent in self.agents.items():
+            field = field_of(key, self.agents)
+            agents.require_fit(agent, self.exploration, spec, task_name, field)
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
@@ -375,8 +367,6 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-    require("proxy" in read(overrides), "proxy", message)
     return _composed(EvaluateConfig, overrides)[0]
 
 
@@ -441,7 +431,9 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
       ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
         tell its agents.
     """
-    source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
+    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
+    require("proxy" in given, "proxy", message)
+    source, hparams = str(given["proxy"]), given.get("agent_hparams")
     groups = "agent", "agents", "exploration"
     words = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
     if source == "real":

@@ -4,12 +4,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sejax import envs
+from sejax import agents, envs
 from sejax.agents.base import AgentConfig
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
+from sejax.runs.compose import field_of
 from sejax.runs.config import EvaluateConfig
 from sejax.training import TrainingConfig
 
@@ -40,8 +41,9 @@ def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
     require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
     task = envs.make(str(config.env))
-    for key in config.agents:
-        config.require_fit(key, task, task.name)
+    for key, agent in config.agents.items():
+        field = field_of(key, config.agents)
+        agents.require_fit(agent, config.exploration, task, task.name, field)
     trainings = dict.fromkeys(config.agents, config.real_training)
     worlds = {"the real task": World(task.env, task.params, trainings)}
     folder = Path(config.out_dir or f"runs/evaluate-{as_file_name(task.name)}")
@@ -54,7 +56,8 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     env, task = proxy.env, proxy.task
     real_training, trainings = _real_training(config, proxy), {}
     for key, agent in config.agents.items():
-        config.require_fit(key, task, task.name)
+        field = field_of(key, config.agents)
+        agents.require_fit(agent, config.exploration, task, task.name, field)
         group, training = "real_training", real_training
         if config.training_from == "config":
             group, training = "training", config.training
