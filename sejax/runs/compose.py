@@ -53,8 +53,9 @@ AGENTS = ("agent", "agents")  # the fields that choose them
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
-# sejax's own preset files, by their stems.
-PRESETS = {x.stem: x for x in sorted(Path(__file__).parents[1].glob("presets/*.yaml"))}
+# The text of sejax's own preset files, by their stems.
+FILES = sorted(Path(__file__).parents[1].glob("presets/*.yaml"))
+PRESETS = {path.stem: path.read_text(encoding="utf-8") for path in FILES}
 BASES, GENERAL = "bases", "general"  # what sections build on; presets of tasks without a file
 # What reading a file of YAML may raise.
 UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
@@ -208,30 +209,27 @@ def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
 
 
 @functools.cache
-def _sections_in(stem: str) -> dict[str, dict[str, Any]]:
-    """The sections of one of sejax's own files, each with what it builds on merged in."""
-    general = f"{GENERAL}-{stem.rpartition('-')[2]}"
-    bases = {} if stem == BASES else _sections_in(BASES)
-    if stem not in (BASES, general):
-        bases = bases | {GENERAL: _sections_in(general)["best"]}
-    sections: dict[str, dict[str, Any]] = {}
-    for name, section in yaml.safe_load(PRESETS[stem].read_text(encoding="utf-8")).items():
-        like = section.pop("like", None)
-        sections[name] = merge({**bases, **sections}[like] if like else {}, section)
+def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+    """The presets of a task and proxy, by their names: its own, and what all tasks have.
+
+    What a section builds on is merged in. It stands before the section.
+    """
+    sections: dict[str, dict[str, Any]] = {"best": {}}
+    bases: dict[str, dict[str, Any]] = {}
+    for stem in (BASES, f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
+        known = bases | {GENERAL: sections["best"]}
+        for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
+            like = section.pop("like", None)
+            known[name] = merge(known[like] if like else {}, section)
+            (bases if stem == BASES else sections)[name] = known[name]
     return sections
 
 
+@functools.cache
 def presets() -> list[str]:
     """All presets that some file has."""
-    return sorted({name for stem in PRESETS if stem != BASES for name in _sections_in(stem)})
-
-
-def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
-    """The presets of a task and proxy, by their names: its own, and what all tasks have."""
-    sections: dict[str, dict[str, Any]] = {"best": {}}
-    for stem in (f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
-        sections |= _sections_in(stem) if stem in PRESETS else {}
-    return sections
+    files = [text for stem, text in PRESETS.items() if stem != BASES]
+    return sorted({name for text in files for name in yaml.safe_load(text)})
 
 
 def _of_preset(
@@ -249,11 +247,15 @@ def _of_preset(
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
-    preset, sections = str(given.get("preset", "best")), sections_of(chosen["env"], chosen["proxy"])
-    if preset not in sections and preset not in presets():
-        raise unknown_name("preset", preset, presets())
-    must = f"must be one that {shortened(chosen['env'])} has ({listed(list(sections))})"
-    require(preset in sections, "preset", f"{must}; got {preset}. Set preset=best.")
+    preset, sections = (
+        str(given.get("preset", "best")),
+        sections_of(str(chosen["env"]), str(chosen["proxy"])),
+    )
+    if preset not in sections:
+        if preset not in presets():
+            raise unknown_name("preset", preset, presets())
+        must = f"must be one that {shortened(chosen['env'])} has ({listed(list(sections))})"
+        raise ConfigError(f"preset {must}; got {preset}. Set preset=best.", "preset")
     section = sections[preset]
     objective = given.get("objective", section.get("objective", {}).get("name", objective))
     beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}

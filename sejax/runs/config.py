@@ -173,10 +173,11 @@ class LearnConfig(CommandConfig):
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
-        is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
-        message = f"must be false with objective={self.name('objective')}, whose scores are no"
-        require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
-        spec, task_name = envs.spec_of(self.env), self.name("env")
+        if self.stop_when_solved and not getattr(self.objective, "scores_are_returns", True):
+            must = f"must be false with objective={self.name('objective')}, whose scores are no"
+            message = f"stop_when_solved {must} returns. Set stop_when_solved=false."
+            raise ConfigError(message, "stop_when_solved")
+        spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
         for key, agent in self.agents.items():
             field = field_of(key, self.agents)
