@@ -199,7 +199,7 @@ def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
 
 
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
-    """A row for each agent of a kind."""
+    """A row for each agent of an algorithm."""
     env, env_params, trainings = setup.worlds[world]
     is_varied = config.agent_hparams == "varied"
     agent = agents.make_agent(config.agents[key], setup.task, config.exploration, is_varied)
@@ -248,7 +248,7 @@ def spread(mean: float, std: float, digits: int) -> str:
 def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
     (first, *others) = config.agents
-    who = "agents of each kind" if others else f"{first} agents"
+    who = "agents of each algorithm" if others else f"{first} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

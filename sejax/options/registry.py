@@ -29,7 +29,6 @@ import copy
 import dataclasses
 import functools
 import importlib.metadata
-import importlib.util
 import inspect
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -231,8 +230,7 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
-      ConfigError: for an unknown name or field, a value that cannot be, or a package that a plugin
-        names as its `package` and that is not installed.
+      ConfigError: for an unknown name or field, or a value that cannot be.
 
     Example:
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
@@ -248,12 +246,7 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
         others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
         message = f"is a field of {group}={', '.join(others)}. Set one of them."
         require(not others, f"{group}.{field}", message)
-    config = from_plain(cls, fields, group, imports)
-    package = None if "package" in known else getattr(cls, "package", None)
-    is_there = package is None or importlib.util.find_spec(package) is not None
-    must = f"must be installed; got {values['name']} without the package {package}"
-    require(is_there, group, f"{must}. Install it with pip install 'sejax[{values['name']}]'.")
-    return config
+    return from_plain(cls, fields, group, imports)
 
 
 def describe(group: str, config: Makes[Any]) -> dict[str, Any]:

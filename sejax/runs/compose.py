@@ -2,7 +2,7 @@
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
 texts; `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
-every group (the given one, else what the task and the proxy suggest), and lays the layers on each
+every group (that of a word, else what the task and the proxy suggest), and lays the layers on each
 other: the choices, the preset or what a stored proxy was learned with, and the words. Whether their
 names are fields of the choices shows when dataclasses are made of them.
 
@@ -113,10 +113,10 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
       ConfigError: as `words`, and for a file that cannot be read.
     """
-    given: dict[str, Any] = {name: unquoted(text) for name, text in words(overrides).items()}
-    if not given.get("preset", "").endswith(".yaml"):
-        return given
-    path = Path(expanded(given.pop("preset")))
+    values: dict[str, Any] = {name: unquoted(text) for name, text in words(overrides).items()}
+    if not values.get("preset", "").endswith(".yaml"):
+        return values
+    path = Path(expanded(values.pop("preset")))
     try:
         flat = flatten(dict(yaml.safe_load(path.read_text(encoding="utf-8"))))
     except UNREADABLE as error:
@@ -125,10 +125,10 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
         raise ConfigError(must, "preset") from error
     # An older run's config.yaml has null in the place of what it did not choose.
     of_file = {CHOICES.get(k, k): x for k, x in flat.items() if k not in AGENTS or x is not None}
-    if chosen := agents_of(given):  # in place of the file's
+    if chosen := agents_of(values):  # in place of the file's
         others = tuple(f"agents.{key}." for key in agents_of(of_file) if key not in chosen)
         of_file = {k: x for k, x in of_file.items() if k not in AGENTS and not k.startswith(others)}
-    return of_file | given
+    return of_file | values
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -155,8 +155,8 @@ def swept(
     Args:
       overrides: of the sweep.
       make: makes a configuration of a run's words.
-      field: that names the folder. If it is given, each run has a folder in it.
-      folder_of: the folder of a configuration otherwise, given a name of what is swept.
+      field: that names the folder. If it is set, each run has a folder in it.
+      folder_of: the folder of a configuration otherwise, by a name of what is swept.
       known: fields that tell default folders apart already.
     """
     configs = []
@@ -186,22 +186,22 @@ def field_of(key: str, keys: Collection[str]) -> str:
     return f"agents.{key}" if len(keys) > 1 else "agent"
 
 
-def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
+def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
     """The names of agents by their keys; empty where none is chosen.
 
     `agent=ddqn` and `agents=[ddqn,ppo]` choose them, and `agents.KEY.name=ddqn` by any key.
     """
     chosen: dict[str, str] = {}
-    for field in [name for name in ("agents", "agent") if name in given]:
-        value = parsed(str(given[field]))
+    for field in [name for name in ("agents", "agent") if name in values]:
+        value = parsed(str(values[field]))
         names = [*map(as_text, value if isinstance(value, list) else [value])]
         several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
         is_clear = names and not chosen and len({*names}) == len(names)
-        message = f"must name each agent once; got {shortened(given[field])}. Set agents="
+        message = f"must name each agent once; got {shortened(values[field])}. Set agents="
         require(is_clear, field, f"{message}[{shortened(several)}].")
         chosen = {key_of(name): name for name in names}
     by_key = re.compile(r"agents\.([\w-]+)\.name")
-    named = {match[1]: str(x) for name, x in given.items() if (match := by_key.fullmatch(name))}
+    named = {match[1]: str(x) for name, x in values.items() if (match := by_key.fullmatch(name))}
     return chosen | named
 
 
@@ -233,12 +233,12 @@ def presets() -> list[str]:
 
 
 def _of_preset(
-    given: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str], objective: str
+    values: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str], objective: str
 ) -> dict[str, Any]:
     """The settings of a preset for these choices, nested plain values.
 
     Args:
-      given: by the names of words.
+      values: by the names of words.
       chosen: the choice of each group.
       names: of the agents by their keys. What a section says of other groups beside an agent holds
         where that is the only one.
@@ -248,7 +248,7 @@ def _of_preset(
       ConfigError: for an unknown preset, or one that the task does not have.
     """
     preset, sections = (
-        str(given.get("preset", "best")),
+        str(values.get("preset", "best")),
         sections_of(str(chosen["env"]), str(chosen["proxy"])),
     )
     if preset not in sections:
@@ -257,7 +257,7 @@ def _of_preset(
         must = f"must be one that {shortened(chosen['env'])} has ({listed(list(sections))})"
         raise ConfigError(f"preset {must}; got {preset}. Set preset=best.", "preset")
     section = sections[preset]
-    objective = given.get("objective", section.get("objective", {}).get("name", objective))
+    objective = values.get("objective", section.get("objective", {}).get("name", objective))
     beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}
     settings = merge(
         {name: x for name, x in section.items() if not name.startswith("with_")},
@@ -291,34 +291,34 @@ def compose(
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given, texts = read(overrides), words(overrides).values()
+    values, texts = read(overrides), words(overrides).values()
     typed = frozenset(x.strip("[]'\" ") for text in texts for x in split(text.strip("[]")))
-    names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
+    names = agents_of(values) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = agents.DEFAULTS[0]
-        task = {name[4:]: x for name, x in given.items() if name.startswith("env.")}
-        task["name"] = given.get("env", DEFAULTS["env"])
+        task = {name[4:]: x for name, x in values.items() if name.startswith("env.")}
+        task["name"] = values.get("env", DEFAULTS["env"])
         with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
             default = agents.default_for(envs.spec_of(registry.configure("env", task, typed)))
         names = {default: default}
-    chosen: dict[str, Any] = {group: given.get(group, DEFAULTS[group]) for group in groups}
+    chosen: dict[str, Any] = {group: values.get(group, DEFAULTS[group]) for group in groups}
     layers: Layers = {
         "default": {group: {"name": name} for group, name in chosen.items()}
         | {"agents": {key: {"name": name} for key, name in names.items()}}
     }
     if learns:
         objective = registry.find("proxy", chosen["proxy"], typed).default_objective
-        of_preset = _of_preset(given, chosen, names, objective)
+        of_preset = _of_preset(values, chosen, names, objective)
         layers[f"preset={of_preset['preset']}"] = of_preset
-    return layers | {"proxy": stored, "typed": _nested(given, names, groups)}, typed
+    return layers | {"proxy": stored, "typed": _nested(values, names, groups)}, typed
 
 
 def _nested(
-    given: Mapping[str, Any], keys: Collection[str], groups: Collection[str]
+    values: Mapping[str, Any], keys: Collection[str], groups: Collection[str]
 ) -> dict[str, Any]:
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
-    for name, value in given.items():
+    for name, value in values.items():
         if name in (*groups, *AGENTS):
             continue
         group, _, field = name.partition(".")

@@ -6,6 +6,7 @@ value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
+import importlib.util
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,7 +55,7 @@ class Share(Options):
     """An agent's part in a mixture: `agents.KEY.weight`.
 
     Attributes:
-      weight: share of the candidates that train it; with 0 it only judges incumbents
+      weight: share of the candidates that train it; with 0 it only judges the search mean
     """
 
     group: ClassVar[str] = "share"
@@ -129,7 +130,7 @@ class LearnConfig(CommandConfig):
     """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
 
     Attributes:
-      weights: of the agents; equal if not given
+      weights: of the agents; equal if left out
       preset: settings that were measured (best) or published (paper)
       env: the real task
       proxy: what is learned: a synthetic environment (se) or a reward network (rn)
@@ -141,7 +142,7 @@ class LearnConfig(CommandConfig):
         each training.
       generations: n_o: steps of the outer loop.
       num_seeds: Independent runs, with seeds seed, seed + 1, ...
-      stop_when_solved: End a run at its first incumbent mean that reaches the solved threshold.
+      stop_when_solved: End a run when the search mean first reaches the solved score.
       checkpoint_every: generations between checkpoints
       run_dir: null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
 
@@ -170,6 +171,12 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for group in ("tracker", "machines"):
+            package = getattr(getattr(self, group), "package", None)
+            if package is not None and importlib.util.find_spec(package) is None:
+                must = f"{group} must be installed; got {self.name(group)} without the package"
+                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
+                raise ConfigError(f"{must} {package}. {fix}.", group)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
@@ -233,7 +240,7 @@ class EvaluateConfig(CommandConfig):
     Attributes:
       proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
       env: the task, where proxy=real or the proxy's is your own
-      proxy_kind: my_module:MyProxy, where the proxy is of a kind of your own
+      proxy_kind: my_module:MyProxy, where the proxy is one of your own
       agent_hparams: as_learned: agents and exploration that the proxy was learned with, where no
         agent is named; default: the agent's; varied: drawn around them for each agent.
       training_from: How long agents train on the proxy. proxy: on an SE as it was learned with, on
@@ -421,7 +428,7 @@ def words_of(config: CommandConfig) -> dict[str, Any]:
     return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
 
 
-def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
+def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a proxy was learned with, as far as the agents of an evaluation have it.
 
     Where its words name no agent, they are all of the proxy's, with their exploration; of a file
@@ -433,10 +440,10 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
         tell its agents.
     """
     message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-    require("proxy" in given, "proxy", message)
-    source, hparams = str(given["proxy"]), given.get("agent_hparams")
+    require("proxy" in values, "proxy", message)
+    source, hparams = str(values["proxy"]), values.get("agent_hparams")
     groups = "agent", "agents", "exploration"
-    words = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
+    words = {name: x for name, x in values.items() if name.partition(".")[0] in groups}
     if source == "real":
         return {}
     field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
@@ -460,5 +467,5 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
         return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
     default = agents.default_for(stored.spec)
     by_name = {x["name"]: x for x in learned.values()} if hparams is None else {}
-    names = agents_of(given) or {default: default}
+    names = agents_of(values) or {default: default}
     return {"agents": {key: by_name.get(name, {"name": name}) for key, name in names.items()}}
