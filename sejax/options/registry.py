@@ -38,6 +38,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_c
 from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
+PASS_AN_OBJECT = "Pass an object; sejax.config([...]) takes names."
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
@@ -94,7 +95,7 @@ GROUPS = {
     "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config",)),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
-# Names that come with sejax.
+# Names that come with sejax; the first of a group is the choice where nothing else makes one.
 BUILT_IN = {
     "env": {
         "cartpole": "sejax.envs.classic:CartPole",
@@ -124,24 +125,24 @@ BUILT_IN = {
         "q_learning": "sejax.agents.tabular:QLearningConfig",
         "sarsa": "sejax.agents.tabular:SARSAConfig",
     },
+    "proxy": {
+        "se": "sejax.proxies.synthetic:SyntheticConfig",
+        "rn": "sejax.proxies.reward:RewardConfig",
+    },
     "exploration": {
         "none": "sejax.agents.base:NoExploration",
         "icm": "sejax.agents.exploration:ICMConfig",
         "count_based": "sejax.agents.exploration:CountBasedConfig",
     },
-    "proxy": {
-        "se": "sejax.proxies.synthetic:SyntheticConfig",
-        "rn": "sejax.proxies.reward:RewardConfig",
+    "es": {
+        "nes": "sejax.es.nes:NESConfig",
+        **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
     },
     "objective": {
         "max_reward": "sejax.objectives:MaxReward",
         "reward_threshold": "sejax.objectives:RewardThreshold",
         "auc": "sejax.objectives:AUC",
         "auc_sum": "sejax.objectives:AUCSum",
-    },
-    "es": {
-        "nes": "sejax.es.nes:NESConfig",
-        **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
     },
     "tracker": {
         "none": "sejax.runs.trackers:NoTracker",
@@ -297,12 +298,7 @@ def is_hashable(config: object) -> bool:
     return True
 
 
-def require_part(
-    group: str,
-    cls: type[T],
-    part: object,
-    fix: str = "Pass an object; sejax.config([...]) takes names.",
-) -> T:
+def require_part(group: str, cls: type[T], part: object, fix: str = PASS_AN_OBJECT) -> T:
     """The part, if it is one of this class.
 
     Raises:

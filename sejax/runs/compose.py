@@ -40,15 +40,7 @@ from sejax.options import (
 from sejax.options.plain import expanded, flatten, merge, parsed, split, unquoted
 
 # Choices where neither a word nor the task or the proxy makes one.
-DEFAULTS = {
-    "env": "cartpole",
-    "proxy": "se",
-    "exploration": "none",
-    "es": "nes",
-    "objective": "max_reward",
-    "tracker": "none",
-    "machines": "local",
-}
+DEFAULTS = {group: next(iter(x)) for group, x in registry.BUILT_IN.items() if group != "agent"}
 AGENTS = ("agent", "agents")  # the fields that choose them
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 # A choice may stand beside its fields, as in config.yaml.
