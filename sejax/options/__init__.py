@@ -25,6 +25,7 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import os
 import re
@@ -308,29 +309,19 @@ def not_negative(reason: str = "it is a size") -> Rule[float]:
     return between(0, MOST, reason)
 
 
-def finite(reason: str) -> Rule[float]:
-    """A finite number, of either sign."""
-    return between(-MOST, MOST, reason)
-
-
 def positive(reason: str, at_most: float = MOST) -> Rule[float]:
     """A finite number above 0 with which programs can compute in 32 bits."""
     return between(LEAST, at_most, reason)
 
 
-def fraction() -> Rule[float]:
-    """A number in [0, 1]."""
-    return between(0, 1, "it is a fraction")
-
-
-def shrinks() -> Rule[float]:
-    """A factor in (0, 1]."""
-    return between(LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
-
-
-def seed() -> Rule[float]:
-    """A seed that `jax.random.key` takes as it is."""
-    return between(0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
+#: `finite(reason)` is a finite number, of either sign.
+finite = functools.partial(between, -MOST, MOST)
+#: `fraction()` is a number in [0, 1].
+fraction = functools.partial(between, 0, 1, "it is a fraction")
+#: `shrinks()` is a factor in (0, 1].
+shrinks = functools.partial(between, LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
+#: `seed()` is a seed that `jax.random.key` takes as it is.
+seed = functools.partial(between, 0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
 
 
 def one_of(known: Collection[str]) -> Rule[str]:
