@@ -279,9 +279,9 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     key = (group, config if is_hashable(config) else id(config), *arguments)
     if key not in _PARTS:
         part = config.make(*arguments)
-        name = shortened(name_of(group, config))
-        message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
-        require(isinstance(part, cls), group, message)
+        if not isinstance(part, cls):
+            got = f"{type(part).__name__} from {shortened(name_of(group, config))}"
+            raise ConfigError(f"{group} must make a sejax.{cls.__name__}; got {got}.", group)
         _PARTS[key] = config, part  # with config, its id stays its own
     return cast(T, _PARTS[key][1])
 

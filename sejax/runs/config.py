@@ -210,10 +210,10 @@ class LearnConfig(CommandConfig):
         task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
         learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
         names, weights = tuple(self.agents), self.weights
-        several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
+        mixture = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
             "task": task,
-            "agent": several if len(learners) > 1 else learners[0],
+            "agent": mixture if len(learners) > 1 else learners[0],
             "proxy": registry.make("proxy", self.proxy, task),
             "es": self.es,
             "objective": registry.make("objective", self.objective, task),
@@ -322,34 +322,34 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
 def _from_plain(
     schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
 ) -> Schema:
-    objects, fields = dict(values), fields_of(schema)
-    several, single = objects.pop("agents", None) or {}, objects.pop("agent", None)
-    if single is not None:  # as an older file has it
-        several = {key_of(str(dict(single).get("name"))): single, **several}
-    is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
-    message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
-    require(is_map and several, "agents", message)
-    shared = {name: x for name, x in several.items() if not isinstance(x, Mapping)}
-    shared = shared if schema.learns else {}
-    keys, weights = sorted(several.keys() - shared.keys()), []
-    objects["agents"] = {}
+    """A command's configuration from nested plain values; see `learn_config`."""
+    parts, fields = dict(values), fields_of(schema)
+    by_key, only = parts.pop("agents", None) or {}, parts.pop("agent", None)
+    if only is not None:  # as an older file has it
+        by_key = {key_of(str(dict(only).get("name"))): only, **by_key}
+    is_map = isinstance(by_key, Mapping) and all(key == key_of(str(key)) for key in by_key)
+    message = f"must be agents by keys that are words; got {shortened(by_key)}. {FIX}"
+    require(is_map and by_key, "agents", message)
+    keys = sorted(k for k, x in by_key.items() if isinstance(x, Mapping) or not schema.learns)
+    parts["agents"], weights = {}, []
     for key in keys:
-        where, agent = field_of(shortened(key, 40), keys), several[key]
-        agent = dict(agent) if isinstance(agent, Mapping) else {}
+        field = field_of(shortened(key, 40), keys)
+        agent = dict(by_key[key]) if isinstance(by_key[key], Mapping) else {}
         share = {k: agent.pop(k) for k in fields_of(Share) if schema.learns and k in agent}
-        weights.append(from_plain(Share, share, where).weight)
-        with errors_of("agent", where):
-            objects["agents"][key] = registry.configure("agent", agent, imports)
+        weights.append(from_plain(Share, share, field).weight)
+        with errors_of("agent", field):
+            parts["agents"][key] = registry.configure("agent", agent, imports)
     if schema.learns:
+        shared = {name: x for name, x in by_key.items() if name not in keys}
         mixture = from_plain(MixtureConfig, shared, "agents")
         is_idle = mixture == MixtureConfig() and {*weights} == {1.0}
         field = f"agents.{next(iter(shared), 'KEY.weight')}"
         require(len(weights) > 1 or is_idle, field, f"must come with several agents. {FIX}")
-        objects |= {"weights": weights, "mixture": mixture}
+        parts |= {"weights": weights, "mixture": mixture}
     for group in schema.groups:
-        objects[group] = registry.configure(group, objects.get(group, {}), imports)
-    config = from_plain(schema, {k: x for k, x in objects.items() if k in fields}, "", imports)
-    for name in [name for name in objects if name not in fields]:
+        parts[group] = registry.configure(group, parts.get(group, {}), imports)
+    config = from_plain(schema, {k: x for k, x in parts.items() if k in fields}, "", imports)
+    for name in [name for name in parts if name not in fields]:
         raise unknown_field(str(name), words_of(config))
     return config
 
