@@ -116,12 +116,12 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
             require(group in TAKEN, shortened(name, 40), message)
             others[name] = f"{name}={text}"
     task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
-    kind = envs.spec_of(task.env).actions
-    steps = others.get("training.max_steps", STEPS[kind]).rpartition("=")[2]
+    actions = envs.spec_of(task.env).actions
+    steps = others.get("training.max_steps", STEPS[actions]).rpartition("=")[2]
     # An episode of a one-step SE is a step.
     defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
     if not others.keys() & {"agent", "agents"}:
-        defaults["agents"] = STUDENTS[kind]
+        defaults["agents"] = STUDENTS[actions]
     words = {name: f"{name}={value}" for name, value in defaults.items()}
     config = configuration.config([*(words | others).values()])
     # The task's reward for being healthy is left out of searches.

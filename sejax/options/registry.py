@@ -184,7 +184,7 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
         return resolve_name(BUILT_IN[group][name])
     path = _path_of(group, name)
     if path is None and ":" not in name:
-        raise unknown_name(group, name, [*names(group), *_meant(name)])
+        raise unknown_name(group, name, [*names(group), *_suggestions(name)])
     if path is None:
         require_typed(group, name, imports)
     cls = _as_dataclass(group, name, imported(group, path or name))
@@ -320,12 +320,12 @@ def require_path(field: str, path: str) -> None:
     """
     module, _, attribute = path.partition(":")
     is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
-    got, fix = (shortened(x, 60) for x in (path, *_meant(path), "my_module:MyClass")[:2])
+    got, fix = (shortened(x, 60) for x in (path, *_suggestions(path), "my_module:MyClass")[:2])
     message = f"must be a name or module:attribute; got {got}. Set {field}={fix}."
     require(is_path and not module.endswith(".py"), field, message)
 
 
-def _meant(text: str) -> list[str]:
+def _suggestions(text: str) -> list[str]:
     """The `module:attribute` that a dotted name or the path of a file may stand for."""
     match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
     return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []

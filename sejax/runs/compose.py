@@ -76,7 +76,9 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             got, field = shortened(override), "an override"
-            message = f"{field} must read FIELD=VALUE; got {got}. Write {meant(overrides[i:])}."
+            message = (
+                f"{field} must read FIELD=VALUE; got {got}. Write {suggestion(overrides[i:])}."
+            )
             raise ConfigError(message, field)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
@@ -88,7 +90,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
     return texts
 
 
-def meant(overrides: Sequence[str]) -> str:
+def suggestion(overrides: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
     pattern = r"([-=\s]*)([^\s=]*)(?:[\s=]+([^\s=]+)(?!\S))?"
     dashes, name, value = re.findall(pattern, " ".join(overrides[:3]))[0]
