@@ -187,10 +187,18 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
         raise unknown_name(group, name, [*names(group), *_suggestions(name)])
     if path is None:
         require_typed(group, name, imports)
-    cls = _as_dataclass(group, name, imported(group, path or name))
-    if f"{cls.__module__}:{cls.__qualname__}" != name:
-        _NAMES[cls] = name
-    return cls
+    plugin = imported(group, path or name)
+    if inspect.isfunction(plugin):
+        plugin = _from_function(group, name, plugin)
+    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
+    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
+    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
+    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
+    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
+    require(is_fit, group, f"{must} {shortened(plugin)}.")
+    if f"{plugin.__module__}:{plugin.__qualname__}" != name:
+        _NAMES[plugin] = name
+    return plugin
 
 
 def name_of(group: str, config: Makes[Any]) -> str:
@@ -346,19 +354,6 @@ def imported(field: str, path: str) -> Any:
         got = shortened(path, 60)
         message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
         raise ConfigError(message, field) from error
-
-
-def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
-    """The dataclass that a plugin is, or that a function stands for."""
-    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
-    if inspect.isfunction(plugin):
-        return _from_function(group, name, plugin)
-    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
-    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
-    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
-    require(is_fit, group, f"{must} {shortened(plugin)}.")
-    return plugin
 
 
 @functools.cache

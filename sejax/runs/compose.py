@@ -31,11 +31,11 @@ from sejax.options import (
     Options,
     as_text,
     listed,
+    nearest,
     registry,
     require,
     shortened,
     told,
-    unknown_name,
 )
 from sejax.options.plain import expanded, flatten, merge, parsed, split, unquoted
 
@@ -219,13 +219,6 @@ def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
     return sections
 
 
-@functools.cache
-def presets() -> list[str]:
-    """All presets that some file has."""
-    files = [text for stem, text in PRESETS.items() if stem != BASES]
-    return sorted({name for text in files for name in yaml.safe_load(text)})
-
-
 def _of_preset(
     values: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str], objective: str
 ) -> dict[str, Any]:
@@ -246,10 +239,9 @@ def _of_preset(
         sections_of(str(chosen["env"]), str(chosen["proxy"])),
     )
     if preset not in sections:
-        if preset not in presets():
-            raise unknown_name("preset", preset, presets())
-        must = f"must be one that {shortened(chosen['env'])} has ({listed(list(sections))})"
-        raise ConfigError(f"preset {must}; got {preset}. Set preset=best.", "preset")
+        ranked = nearest(preset, sections)
+        must = f"preset must be one that {shortened(chosen['env'])} has ({listed(ranked)})"
+        raise ConfigError(f"{must}; got {shortened(preset)}. Set preset={ranked[0]}.", "preset")
     section = sections[preset]
     objective = values.get("objective", section.get("objective", {}).get("name", objective))
     beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}

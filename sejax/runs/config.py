@@ -34,7 +34,16 @@ from sejax.options import (
 )
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
-from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, presets, read
+from sejax.runs.compose import (
+    DEFAULTS,
+    Layers,
+    agents_of,
+    compose,
+    field_of,
+    key_of,
+    read,
+    sections_of,
+)
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -399,8 +408,9 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
         known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
-    if schema.learns:
-        lines += [f"  preset: {', '.join([*presets(), 'FILE.yaml'])}"]
+    if isinstance(config, LearnConfig):
+        presets = sections_of(config.name("env"), config.name("proxy"))
+        lines += [f"  preset: {', '.join([*presets, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
     classes += [(name, type(x)) for name, x in vars(config).items()]
