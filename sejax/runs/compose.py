@@ -26,18 +26,8 @@ import yaml
 
 from sejax import agents, envs
 from sejax.ops.files import as_file_name
-from sejax.options import (
-    ConfigError,
-    Options,
-    as_text,
-    listed,
-    nearest,
-    registry,
-    require,
-    shortened,
-    told,
-)
-from sejax.options.plain import expanded, flatten, merge, parsed, split, unquoted
+from sejax.options import ConfigError, Options, listed, nearest, registry, require, shortened, told
+from sejax.options.plain import expanded, flatten, merge, split, unquoted
 
 # Choices where neither a word nor the task or the proxy makes one.
 DEFAULTS = {group: next(iter(x)) for group, x in registry.BUILT_IN.items() if group != "agent"}
@@ -187,10 +177,11 @@ def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in values]:
-        value = parsed(str(values[field]))
-        names = [*map(as_text, value if isinstance(value, list) else [value])]
-        several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
-        is_clear = names and not chosen and len({*names}) == len(names)
+        text = str(values[field])
+        is_list = text.startswith("[") and text.endswith("]")
+        names = [unquoted(name) for name in split(text[1:-1] if is_list else text)]
+        several = ",".join(dict.fromkeys(filter(None, [*chosen.values(), *names]))) or "ddqn,ppo"
+        is_clear = all(names) and not chosen and len({*names}) == len(names)
         message = f"must name each agent once; got {shortened(values[field])}. Set agents="
         require(is_clear, field, f"{message}[{shortened(several)}].")
         chosen = {key_of(name): name for name in names}

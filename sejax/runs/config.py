@@ -34,16 +34,7 @@ from sejax.options import (
 )
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
-from sejax.runs.compose import (
-    DEFAULTS,
-    Layers,
-    agents_of,
-    compose,
-    field_of,
-    key_of,
-    read,
-    sections_of,
-)
+from sejax.runs import compose
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -159,7 +150,7 @@ class LearnConfig(CommandConfig):
       ConfigError: for parts that cannot work together.
     """
 
-    groups: ClassVar[tuple[str, ...]] = tuple(DEFAULTS)
+    groups: ClassVar[tuple[str, ...]] = tuple(compose.DEFAULTS)
     learns: ClassVar[bool] = True
 
     weights: tuple[float, ...] = option(())
@@ -196,7 +187,7 @@ class LearnConfig(CommandConfig):
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
         for key, agent in self.agents.items():
-            field = field_of(key, self.agents)
+            field = compose.field_of(key, self.agents)
             agents.require_fit(agent, self.exploration, spec, task_name, field)
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
@@ -335,14 +326,14 @@ def _from_plain(
     parts, fields = dict(values), fields_of(schema)
     by_key, only = parts.pop("agents", None) or {}, parts.pop("agent", None)
     if only is not None:  # as an older file has it
-        by_key = {key_of(str(dict(only).get("name"))): only, **by_key}
-    is_map = isinstance(by_key, Mapping) and all(key == key_of(str(key)) for key in by_key)
+        by_key = {compose.key_of(str(dict(only).get("name"))): only, **by_key}
+    is_map = isinstance(by_key, Mapping) and all(key == compose.key_of(str(key)) for key in by_key)
     message = f"must be agents by keys that are words; got {shortened(by_key)}. {FIX}"
     require(is_map and by_key, "agents", message)
     keys = sorted(k for k, x in by_key.items() if isinstance(x, Mapping) or not schema.learns)
     parts["agents"], weights = {}, []
     for key in keys:
-        field = field_of(shortened(key, 40), keys)
+        field = compose.field_of(shortened(key, 40), keys)
         agent = dict(by_key[key]) if isinstance(by_key[key], Mapping) else {}
         share = {k: agent.pop(k) for k in fields_of(Share) if schema.learns and k in agent}
         weights.append(from_plain(Share, share, field).weight)
@@ -387,10 +378,10 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     return _composed(EvaluateConfig, overrides)[0]
 
 
-def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:
+def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, compose.Layers]:
     """A command's configuration of its words, and the layers that it comes from."""
-    stored = {} if schema.learns else _learned(read(overrides))
-    layers, imports = compose(overrides, schema.groups, schema.learns, stored)
+    stored = {} if schema.learns else _learned(compose.read(overrides))
+    layers, imports = compose.compose(overrides, schema.groups, schema.learns, stored)
     return _from_plain(schema, merge(*layers.values()), imports), layers
 
 
@@ -409,13 +400,13 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if isinstance(config, LearnConfig):
-        presets = sections_of(config.name("env"), config.name("proxy"))
+        presets = compose.sections_of(config.name("env"), config.name("proxy"))
         lines += [f"  preset: {', '.join([*presets, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
     classes += [(name, type(x)) for name, x in vars(config).items()]
     for key, agent in config.agents.items():
-        classes += [(field_of(key, config.agents), cls) for cls in (Share, type(agent))]
+        classes += [(compose.field_of(key, config.agents), cls) for cls in (Share, type(agent))]
     sources = dict[str, str]()
     for layer, values in layers.items():
         names = flatten(_as_words(values, config.agents))
@@ -467,7 +458,7 @@ def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
         agents_there = header.agents_of(stored.config)
         for agent in agents_there.values():
             header.configured("agent", agent, source)
-        learned = {key_of(key): agent for key, agent in agents_there.items()}
+        learned = {compose.key_of(key): agent for key, agent in agents_there.items()}
     except ConfigError:  # of the proxy, which is said when it is loaded
         if hparams == "as_learned":
             raise
@@ -477,5 +468,5 @@ def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
         return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
     default = agents.default_for(stored.spec)
     by_name = {x["name"]: x for x in learned.values()} if hparams is None else {}
-    names = agents_of(values) or {default: default}
+    names = compose.agents_of(values) or {default: default}
     return {"agents": {key: by_name.get(name, {"name": name}) for key, name in names.items()}}
