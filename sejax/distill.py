@@ -194,7 +194,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     }
     record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
     record |= {"learning": learning, "policy_return": lesson.policy_return}
-    path, plain = folder / "proxy.safetensors", configuration.plain(config)
+    path, plain = folder / "proxy.safetensors", config.plain()
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
@@ -204,7 +204,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
 
 def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
     """What the numbers depend on, as plain values."""
-    plain = configuration.plain(config)
+    plain = config.plain()
     return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 

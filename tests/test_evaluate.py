@@ -47,7 +47,7 @@ def learned(*words):
 def save(path, *words):
     config, env, weights = learned(*words)
     discount = next(iter(config.agents.values())).discount
-    sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
+    sejax.save(path, env, weights, config.plain(), discount, score=1.0, seed=0)
     return path
 
 

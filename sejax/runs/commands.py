@@ -17,7 +17,7 @@ import yaml
 
 from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.runs import compose, runtime
-from sejax.runs.config import CommandConfig, plain
+from sejax.runs.config import CommandConfig
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -45,7 +45,8 @@ def start(
         if {*HELP} & {*words}:
             print(help_text(overrides))
         elif configs_of and PRINT_CONFIG in words:
-            print(yaml.safe_dump_all(map(plain, configs_of(overrides)), sort_keys=False), end="")
+            configs = (config.plain() for config in configs_of(overrides))
+            print(yaml.safe_dump_all(configs, sort_keys=False), end="")
         else:
             main(overrides)
 

@@ -94,6 +94,19 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
+    def plain(self) -> dict[str, Any]:
+        """Nested plain values, as in `config.yaml`; `sejax.save` keeps them with a proxy."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        for group in self.groups:
+            values[group] = registry.describe(group, values[group])
+        of_agents = {key: registry.describe("agent", x) for key, x in self.agents.items()}
+        mixture, weights = values.pop("mixture", None), values.pop("weights", ())
+        if len(of_agents) > 1 and mixture is not None:
+            for agent, weight in zip(of_agents.values(), weights, strict=True):
+                agent["weight"] = weight
+            of_agents |= to_plain(mixture)
+        return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
+
     def require_learning(
         self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
     ) -> None:
@@ -197,10 +210,6 @@ class LearnConfig(CommandConfig):
             return JOINT.join(self.agents)
         return registry.name_of(group, getattr(self, group))
 
-    def plain(self) -> dict[str, Any]:
-        """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
-        return plain(self)
-
     def task(self) -> envs.Task:
         """The real task; it is built once."""
         return envs.make_from(self.env)
@@ -293,20 +302,6 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     return _from_plain(LearnConfig, unsaid | dict(values), imports)
 
 
-def plain(config: CommandConfig) -> dict[str, Any]:
-    """A command's configuration as plain values; inverse of `learn_config`."""
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    for group in config.groups:
-        values[group] = registry.describe(group, values[group])
-    of_agents = {key: registry.describe("agent", x) for key, x in config.agents.items()}
-    mixture, weights = values.pop("mixture", None), values.pop("weights", ())
-    if len(of_agents) > 1 and mixture is not None:
-        for agent, weight in zip(of_agents.values(), weights, strict=True):
-            agent["weight"] = weight
-        of_agents |= to_plain(mixture)
-    return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
-
-
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
@@ -314,7 +309,7 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     is imported.
     """
     try:
-        return plain(learn_config(stored, {*map(str, flatten(plain(config)).values())}))
+        return learn_config(stored, {*map(str, flatten(config.plain()).values())}).plain()
     except ConfigError:
         return dict(stored)
 
@@ -409,23 +404,24 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
         classes += [(compose.field_of(key, config.agents), cls) for cls in (Share, type(agent))]
     sources = dict[str, str]()
     for layer, values in layers.items():
-        names = flatten(_as_words(values, config.agents))
-        sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
-    values = flatten(_as_words(plain(config), config.agents))
+        source = "" if layer == "default" else f" ({layer})"
+        sources |= dict.fromkeys(_as_words(values, config.agents), source)
+    values = _as_words(config.plain(), config.agents)
     fields = {name: x for name, x in values.items() if not name.endswith(".name")}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
-    """Plain values with an only agent's as `agent`, as words have them."""
-    several = values.get("agents", {})
+    """Plain values by the names of words, where an only agent is `agent`."""
+    by_key = values.get("agents", {})
     rest = {name: x for name, x in values.items() if name != "agents"}
-    return rest | ({"agents": several} if len(agents) > 1 else {"agent": several.get(*agents, {})})
+    of_agents = {"agents": by_key} if len(agents) > 1 else {"agent": by_key.get(*agents, {})}
+    return flatten(rest | of_agents)
 
 
 def words_of(config: CommandConfig) -> dict[str, Any]:
     """The value of each field, by its name in words; that of a choice is its name."""
-    values = flatten(_as_words(plain(config), config.agents))
+    values = _as_words(config.plain(), config.agents)
     return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
 
 
