@@ -225,14 +225,13 @@ def _of_preset(
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
     """
-    preset, sections = (
-        str(values.get("preset", "best")),
-        sections_of(str(chosen["env"]), str(chosen["proxy"])),
-    )
+    preset = str(values.get("preset", "best"))
+    sections = sections_of(str(chosen["env"]), str(chosen["proxy"]))
     if preset not in sections:
         ranked = nearest(preset, sections)
         must = f"preset must be one that {shortened(chosen['env'])} has ({listed(ranked)})"
-        raise ConfigError(f"{must}; got {shortened(preset)}. Set preset={ranked[0]}.", "preset")
+        got = f"got {shortened(preset)}. Did you mean preset={ranked[0]}?"
+        raise ConfigError(f"{must}; {got}", "preset")
     section = sections[preset]
     objective = values.get("objective", section.get("objective", {}).get("name", objective))
     beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}
@@ -284,7 +283,7 @@ def compose(
         | {"agents": {key: {"name": name} for key, name in names.items()}}
     }
     if learns:
-        objective = registry.find("proxy", chosen["proxy"], typed).default_objective
+        objective = registry.find("proxy", str(chosen["proxy"]), typed).default_objective
         of_preset = _of_preset(values, chosen, names, objective)
         layers[f"preset={of_preset['preset']}"] = of_preset
     return layers | {"proxy": stored, "typed": _nested(values, names, groups)}, typed
