@@ -166,7 +166,8 @@ def test_overrides_are_a_list_of_text(overrides):
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1",
-                                  "preset: other.yaml", "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]"],
+                                  "preset: other.yaml", "agent: {batch_size: {x: 1}}",
+                                  "1: 2", "\x00", "- &a [*a]"],
 )  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
