@@ -72,7 +72,10 @@ nitpick_ignore_regex = [
         "py:class",
         r"sejax\.(agents\.(base\.T|buffers\.State)|es\.base\.T|proxies\.synthetic\.Vector|envs\.environment\.(State|Params))",
     ),
-    ("py:class", r"sejax\.(options\.parts\.(Makes|RunConfig)|scoring\.Scoring|ops\.networks\.MLP)"),
+    (
+        "py:class",
+        r"sejax\.(options\.registry\.(T|Makes|RunConfig)|scoring\.Scoring|ops\.networks\.MLP)",
+    ),
 ]
 
 # --- HTML ----------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_lowest
 from sejax.options import counts, require
-from sejax.options.parts import Makes, RunConfig, make_part, require_part
+from sejax.options.registry import Makes, RunConfig, make, require_part
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.scoring import GenerationInfo, Scoring
@@ -237,14 +237,14 @@ def make_bilevel(
       ConfigError: if the parts do not fit each other, or there are not so many devices.
     """
     require_part("task", Task, task)
-    proxy = make_part("proxy", ProxyEnv, proxy, task)  # type: ignore[type-abstract]
+    proxy = make("proxy", proxy, task)
     must = f"must be one of the task given; got one of {proxy.task.name}. Set task to the proxy's."
     require(proxy.task is task, "proxy", must)
-    objective = make_part("objective", Objective, objective, task)
+    objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
     _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-    strategy = make_part("es", Strategy, es, num_dims)
+    strategy = make("es", es, num_dims)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,

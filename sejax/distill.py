@@ -9,7 +9,7 @@ A copy of the policy, a small network, becomes the reward of a one-step SE. With
 ones are found by augmented random search: the best of each part of the search becomes an SE,
 students train on each, and the SE that teaches best is kept. Other fields are those of sejax.run
 with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv into run_dir;
-the same command goes on where it was stopped.
+the same command resumes where it stopped.
 """
 
 import dataclasses
@@ -88,7 +88,7 @@ def main(overrides: Sequence[str]) -> None:
     try:
         distill(job, config, folder, shlex.join(overrides))
     except KeyboardInterrupt as stop:
-        commands.interrupted(f"Interrupted. The same command goes on from {folder}.", stop)
+        commands.interrupted(f"Interrupted. The same command resumes from {folder}.", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
@@ -116,12 +116,12 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
             require(group in TAKEN, shortened(name, 40), message)
             others[name] = f"{name}={text}"
     task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
-    kind = envs.spec_of(task.env).actions
-    steps = others.get("training.max_steps", STEPS[kind]).rpartition("=")[2]
+    actions = envs.spec_of(task.env).actions
+    steps = others.get("training.max_steps", STEPS[actions]).rpartition("=")[2]
     # An episode of a one-step SE is a step.
     defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
     if not others.keys() & {"agent", "agents"}:
-        defaults["agents"] = STUDENTS[kind]
+        defaults["agents"] = STUDENTS[actions]
     words = {name: f"{name}={value}" for name, value in defaults.items()}
     config = configuration.config([*(words | others).values()])
     # The task's reward for being healthy is left out of searches.
@@ -194,7 +194,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     }
     record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
     record |= {"learning": learning, "policy_return": lesson.policy_return}
-    path, plain = folder / "proxy.safetensors", configuration.plain(config)
+    path, plain = folder / "proxy.safetensors", config.plain()
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
@@ -204,7 +204,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
 
 def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
     """What the numbers depend on, as plain values."""
-    plain = configuration.plain(config)
+    plain = config.plain()
     return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 

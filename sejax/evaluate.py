@@ -8,24 +8,30 @@ Without agent=NAME they are those that the proxy was learned with.
 Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
 """
 
+import dataclasses
 import json
 import math
 import time
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from sejax.agents import make_agent
+from sejax import agents, envs
+from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
-from sejax.ops.files import require_writable, write_text
+from sejax.ops.files import as_file_name, require_writable, write_text
+from sejax.options import registry, require
+from sejax.proxies import header, hub
+from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
-from sejax.runs.worlds import Setup, proxy_setup, real_setup
+from sejax.training import TrainingConfig
 
 # Columns of the table: what they show, and with how many digits.
 SHOWN = {
@@ -33,6 +39,28 @@ SHOWN = {
     "training steps": ("train_steps", 0),
     "training episodes": ("train_episodes", 1),
 }
+
+
+class World(NamedTuple):
+    """Where agents train, and how long each of them by its key."""
+
+    env: Any
+    params: Any
+    trainings: dict[str, TrainingConfig]
+
+
+class Setup(NamedTuple):
+    """Where agents train and are tested.
+
+    Attributes:
+      task: the real task, on which all are tested.
+      worlds: by name, the first one first in tables.
+      out_dir: where the files go.
+    """
+
+    task: envs.Task
+    worlds: dict[str, World]
+    out_dir: Path
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -69,7 +97,7 @@ def evaluate(config: EvaluateConfig) -> float:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
         cannot be written.
     """
-    setup = real_setup(config) if config.proxy == "real" else proxy_setup(config)
+    setup = setup_of(config)
     out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
@@ -88,11 +116,93 @@ def evaluate(config: EvaluateConfig) -> float:
     return float(first["test_return"].mean())
 
 
+def setup_of(config: EvaluateConfig) -> Setup:
+    """Where the agents of an evaluation train: on the proxy, and on its real task beside it.
+
+    Raises:
+      ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or agents that
+        do not fit it.
+    """
+    if config.proxy == "real":
+        require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
+        proxy, task, real_training = None, envs.make(str(config.env)), config.real_training
+    else:
+        proxy = _load(config)
+        task, real_training = proxy.task, _real_training(config, proxy)
+    trainings = {}
+    for key, agent in config.agents.items():
+        field = compose.field_of(key, config.agents)
+        agents.require_fit(agent, config.exploration, task, task.name, field)
+        group, training = "real_training", real_training
+        if config.training_from == "config":
+            group, training = "training", config.training
+        elif proxy is not None and not proxy.env.is_real:  # else as on the real task
+            training = _as_learned(proxy, config, agent)
+        if proxy is not None:
+            config.require_learning(key, group, training, proxy.env.config, task)
+        trainings[key] = training
+    worlds, folder = {}, Path("runs", f"evaluate-{as_file_name(task.name)}")
+    if proxy is not None:
+        worlds["the proxy"] = World(proxy.env, proxy.params, trainings)
+        folder = proxy.path.parent
+        if folder == header.PRETRAINED_DIR or hub.is_address(config.proxy):
+            name = as_file_name(config.proxy.removeprefix(hub.SCHEME))
+            folder = Path("runs", f"evaluate-{name}")
+    if proxy is None or config.baseline:
+        trainings = dict.fromkeys(trainings, real_training)
+        worlds["the real task"] = World(task.env, task.params, trainings)
+    return Setup(task, worlds, Path(config.out_dir or folder))
+
+
+def _load(config: EvaluateConfig) -> Proxy:
+    """The proxy; modules are imported if the command line names them, never because a file does.
+
+    Raises:
+      ConfigError: if it cannot be loaded, or `env` is not its task.
+    """
+    path = header.find(config.proxy, "proxy", also=("real",))
+    stored = header.read(path, "proxy").header.config
+    task = proxy_config = None
+    if config.env is not None and not registry.is_registered("env", config.env):
+        fields = stored["env"] if stored["env"].get("name") == config.env else {}
+        task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
+    if config.proxy_kind is not None:
+        fields = {**stored["proxy"], "name": config.proxy_kind}
+        proxy_config = registry.configure("proxy", fields)
+    proxy = load_proxy(path, task, proxy_config, "proxy")
+    name = proxy.task.name
+    is_same = config.env in (None, name, proxy.config["env"].get("name"))
+    require(is_same, "env", f"must be the proxy's own task; got {config.env}. Set env={name}.")
+    return proxy
+
+
+def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
+    """How long agents train on an SE, which its file says."""
+    message = "must be config for an SE whose file does not say how long agents train. Set "
+    fix = "training_from=config training.max_steps=2000 training.max_episodes=2000."
+    require("training" in proxy.config, "training_from", message + fix)
+    test_episodes = config.real_training.test_episodes
+    return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
+
+
+def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
+    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
+    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
+    if not (as_learned and proxy.env.is_real):
+        return config.real_training
+    is_terminal = training_of(proxy).time_limit_is_terminal
+    default = TrainingConfig().time_limit_is_terminal
+    is_same = config.real_training.time_limit_is_terminal in (default, is_terminal)
+    message = "must be as the proxy's agents learned. Leave it out, or set agent_hparams=default."
+    require(is_same, "real_training.time_limit_is_terminal", message)
+    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
+
+
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
-    """A row for each agent of a kind."""
+    """A row for each agent of an algorithm."""
     env, env_params, trainings = setup.worlds[world]
     is_varied = config.agent_hparams == "varied"
-    agent = make_agent(config.agents[key], setup.task, config.exploration, is_varied)
+    agent = agents.make_agent(config.agents[key], setup.task, config.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
@@ -138,7 +248,7 @@ def spread(mean: float, std: float, digits: int) -> str:
 def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
     (first, *others) = config.agents
-    who = "agents of each kind" if others else f"{first} agents"
+    who = "agents of each algorithm" if others else f"{first} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

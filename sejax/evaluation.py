@@ -24,7 +24,7 @@ from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, in_batches_on_cpu, spread_over_devices
 from sejax.options import LARGEST, require
-from sejax.options.parts import require_part
+from sejax.options.registry import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer, num_parallel_on_cpu
 

@@ -34,7 +34,7 @@ from sejax.options import (
     require,
     shortened,
 )
-from sejax.options.parts import require_part
+from sejax.options.registry import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 
 STOP_RULES = ("plateau", "solved", "never")

@@ -17,7 +17,7 @@ from sejax.options.plain import flatten, parsed
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.compose import expand
-from sejax.runs.config import EvaluateConfig, LearnConfig, evaluate_config, plain
+from sejax.runs.config import EvaluateConfig, LearnConfig, evaluate_config
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"]
 
@@ -148,11 +148,11 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
 ])  # fmt: skip
 def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, overrides):
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
-    values = plain(config)
+    values = config.plain()
     assert configuration.learn_config(values) == config
     assert configuration.completed(values, config) == values
     if len(config.agents) == 1:  # as files had it before
-        older = values | {"agent": plain(config)["agents"].popitem()[1], "agents": None}
+        older = values | {"agent": config.plain()["agents"].popitem()[1], "agents": None}
         assert configuration.learn_config(older) == config
     preset = tmp_path / "config.yaml"
     preset.write_text(yaml.safe_dump(values))
@@ -165,8 +165,9 @@ def test_overrides_are_a_list_of_text(overrides):
     assert refusal(sejax.config, overrides).field == "overrides"
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "nope: 1", "preset: other.yaml",
-                                  "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]"],
+@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1",
+                                  "preset: other.yaml", "agent: {batch_size: {x: 1}}",
+                                  "1: 2", "\x00", "- &a [*a]"],
 )  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
@@ -246,7 +247,7 @@ def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
             assert len(str(error)) <= 300 and error.field, (overrides, error)
             continue
         composed += 1
-        values = flatten(plain(config) | {"agent": plain(config)["agents"].popitem()[1]})
+        values = flatten(config.plain() | {"agent": config.plain()["agents"].popitem()[1]})
         for name, text in dict(x.split("=", 1) for x in overrides).items():
             typed = parsed(text)  # nan is not itself
             assert "." not in name or values[name] == typed or typed != typed, (overrides, name)

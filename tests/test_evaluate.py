@@ -16,14 +16,13 @@ from support import is_drawn, paper_se, paper_training, refusal, refused
 import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
-from sejax.evaluate import evaluate, summarise
+from sejax.evaluate import evaluate, setup_of, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import registry
 from sejax.proxies.io import budget_for
 from sejax.runs import config as configuration
 from sejax.runs import plots
-from sejax.runs.worlds import proxy_setup
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
 SE = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", "proxy.done=soft",
@@ -48,7 +47,7 @@ def learned(*words):
 def save(path, *words):
     config, env, weights = learned(*words)
     discount = next(iter(config.agents.values())).discount
-    sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
+    sejax.save(path, env, weights, config.plain(), discount, score=1.0, seed=0)
     return path
 
 
@@ -79,7 +78,7 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
     steps = summary["the real task"]["sarsa"]["train_steps_mean"]
     assert steps == pytest.approx(of_sarsa.train_steps.mean())
     printed = capsys.readouterr().out
-    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 6
+    assert "2 fresh agents of each algorithm" in printed and printed.count("sarsa") == 6
     assert is_drawn(tmp_path / "evaluation.png")
 
 
@@ -121,7 +120,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     words = ("agents=[ddqn,ppo]", "agents.ddqn.warmup_episodes=2", "agents.ppo.rollout_steps=100",
              "proxy.hidden_size=4", "training.max_steps=4000", *SE[3:])  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    setup = proxy_setup(evaluate_config(
+    setup = setup_of(evaluate_config(
         f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]", "agents.dueling_ddqn.warmup_episodes=10",
         "agents.ppo.rollout_steps=null"))  # fmt: skip
     budgets = {key: x.max_steps for key, x in setup.worlds["the proxy"].trainings.items()}
@@ -130,7 +129,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
-    assert proxy_setup(as_learned).worlds["the proxy"].trainings["ppo"].max_steps == 4000
+    assert setup_of(as_learned).worlds["the proxy"].trainings["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
@@ -160,7 +159,7 @@ def test_what_cannot_be_trained_is_refused_before_anything_starts(
 def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(word, expected, tmp_path):
     """Pendulum's bootstrap there; on the real task beside the RN they do likewise."""
     path = save(tmp_path / "proxy.safetensors", "env=pendulum", "proxy=rn")
-    for world in proxy_setup(evaluate_config(f"proxy={path}", word)).worlds.values():
+    for world in setup_of(evaluate_config(f"proxy={path}", word)).worlds.values():
         assert world.trainings["td3"].time_limit_is_terminal == expected
 
 
@@ -169,9 +168,9 @@ def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, 
     proxies, bare = sejax.load_set(room), tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights)
     words = f"proxy={bare}", "agent=q_learning", "baseline=false"
-    assert refused(proxy_setup, evaluate_config(*words)) == "training_from"
+    assert refused(setup_of, evaluate_config(*words)) == "training_from"
     given = "training_from=config", "training.max_steps=7", "training.stop_rule=never"
-    setup = proxy_setup(evaluate_config(*words, *given))
+    setup = setup_of(evaluate_config(*words, *given))
     ((name, world),) = setup.worlds.items()
     assert name == "the proxy" and world.trainings["q_learning"].max_steps == 7
 
@@ -181,7 +180,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     words = "env=cliff_walking", "proxy=rn", "exploration=count_based"
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
-    setup, learner = proxy_setup(config), learned(*words)[0]
+    setup, learner = setup_of(config), learned(*words)[0]
     assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
     assert setup.worlds["the proxy"].trainings == {"q_learning": config.real_training}

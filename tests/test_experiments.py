@@ -23,7 +23,6 @@ from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax.options import ConfigError, each_of, registry
-from sejax.runs import config as configuration
 from sejax.runs import workers
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
@@ -78,7 +77,7 @@ def save_ses(path, num, *overrides):
     shapes = shapes_of(env.init_weights, jax.random.key(0))
     weights = [random_like(shapes, seed=5 + i) for i in range(num)]
     records = [{"score": 1.0 + i, "generation": 4, "seed": 7 + i} for i in range(num)]
-    sejax.save_set(path, env, weights, records, configuration.plain(config))
+    sejax.save_set(path, env, weights, records, config.plain())
     return str(path)
 
 

@@ -12,9 +12,9 @@ from safetensors.numpy import save
 from support import paper_se, refusal, refused
 
 import sejax
+from sejax.evaluate import setup_of
 from sejax.proxies import header, hub
 from sejax.runs.config import evaluate_config
-from sejax.runs.worlds import proxy_setup
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
 
@@ -202,5 +202,5 @@ def test_what_cannot_be_read_or_written_is_one_message(the_hub, monkeypatch):
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     sejax.push("cartpole", "me/se")
-    study = proxy_setup(evaluate_config(["proxy=hf://me/se@0"]))
+    study = setup_of(evaluate_config(["proxy=hf://me/se@0"]))
     assert study.task.name == "cartpole" and str(study.out_dir) == "runs/evaluate-me_se_0"

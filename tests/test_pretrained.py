@@ -16,11 +16,11 @@ from support import refused
 import sejax
 from sejax import envs
 from sejax.distill import read
+from sejax.evaluate import setup_of
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.options import registry
 from sejax.proxies import header, zoo
 from sejax.runs.config import evaluate_config
-from sejax.runs.worlds import proxy_setup
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -48,7 +48,7 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
         assert learning.cpu_s > 0 and learning.train_steps > learning.agents
         assert learning.generations >= proxy.generation
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    study = proxy_setup(evaluate_config(words.split()))
+    study = setup_of(evaluate_config(words.split()))
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean)
     assert best.agent in study.worlds["the proxy"].trainings, "the command trains what did best"
 

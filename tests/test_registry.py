@@ -109,9 +109,9 @@ def offered(module, monkeypatch):
     ]
     offers = {"sejax.agents": points}
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: offers.get(group, []))
-    registry._offered.cache_clear()
+    registry._paths.cache_clear()
     yield name
-    registry._offered.cache_clear()
+    registry._paths.cache_clear()
 
 
 def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(offered):
@@ -120,7 +120,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
     assert offered not in sys.modules
     config = sejax.config(["env=gridworld_2x2", "agent=mine", "agent.extra=3"])
     assert (config.agent.extra, config.name("agent")) == (3, "mine")
-    assert configuration.learn_config(configuration.plain(config)) == config
+    assert configuration.learn_config(config.plain()) == config
     assert registry.find("agent", "ddqn") is sejax.DDQNConfig  # a name of sejax's own stays
     assert "'Nope'" in refused("agent", "broken")
 

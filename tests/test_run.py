@@ -131,7 +131,8 @@ def test_seeds_run_one_after_the_other_on_one_executable(
     assert compiled == [2]
     said = capsys.readouterr().out
     assert all(
-        f"{tmp_path}/seed{seed}" in said.split("Best incumbent scores:")[1] for seed in (12, 13)
+        f"{tmp_path}/seed{seed}" in said.split("Best scores of the search mean:")[1]
+        for seed in (12, 13)
     )
     assert {path.name for path in tmp_path.iterdir()} == {"seed12", "seed13"}
     for seed, score in zip((12, 13), best, strict=True):
@@ -302,7 +303,7 @@ def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
     words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
     ended = process(sys.executable, "-c", DRIVER, number.name, *words)
     assert ended.returncode == 128 + number, ended.stderr
-    (count,) = re.findall(r"(\d+) generations are saved in .* goes on from there", ended.stdout)
+    (count,) = re.findall(r"(\d+) generations are saved in .* resumes from there", ended.stdout)
     assert int(count) == len(rows(tmp_path)) >= 2 and (tmp_path / "proxy.safetensors").exists()
     assert f"Going on at generation {count}" in learn(tmp_path, f"generations={int(count) + 1}")
 

@@ -68,7 +68,7 @@ run_command, evaluate_command, search_command = (
 
 def stored(*words, **changes):
     """A run's configuration as plain values, with some of somebody else's."""
-    return configuration.plain(sejax.config([*TASK, *words])) | changes
+    return sejax.config([*TASK, *words]).plain() | changes
 
 
 def write_run(path, config):
@@ -159,7 +159,7 @@ def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
     env = registry.make("proxy", paper_se(hidden_size=2), task)
-    usual = {**configuration.plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
+    usual = {**sejax.config().plain(), "proxy": registry.describe("proxy", env.config)}
     weights = env.init_weights(jax.random.key(0))
     sejax.save("evil.safetensors", env, weights, config=usual | config)
 

@@ -72,11 +72,11 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
     if path.is_dir():
         ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
         stored = yaml.safe_load((path / "config.yaml").read_text())
-        config = configuration.plain(configuration.learn_config(stored))
+        config = configuration.learn_config(stored).plain()
         costs = {name: ended[name] for name in COSTS}
     elif curves.exists():
         learned = configuration.learn_config(proxy.config)  # with the names of today
-        config = json.loads(json.dumps(configuration.plain(learned)))
+        config = json.loads(json.dumps(learned.plain()))
         config |= {"seed": proxy.record["seed"], "num_seeds": 1}
         rows = pd.read_csv(curves).query("variant == @path.stem and seed == @config['seed']")
         costs = {"generations": len(rows), "real_steps": int(rows["env_steps_total"].max())}
@@ -105,7 +105,7 @@ def words_of(config: Mapping[str, Any]) -> list[str]:
 def differing(words: list[str], config: Mapping[str, Any]) -> list[str]:
     """The fields, as overrides, in which what these words compose is another run."""
     try:
-        composed = flatten(json.loads(json.dumps(configuration.plain(sejax.config(words)))))
+        composed = flatten(json.loads(json.dumps(sejax.config(words).plain())))
     except sejax.ConfigError as error:  # without the word that a field belongs to
         return [str(error)]
     texts = {name: x if isinstance(x, str) else json.dumps(x, separators=(",", ":"))

@@ -21,7 +21,6 @@ from experiments.common.experiment import Settings, count, setting
 from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, require
-from sejax.runs import config as configuration
 from sejax.runs import run_directory, session, workers
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
@@ -117,7 +116,7 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
         sets[0].env,
         [proxy.params.weights for proxy in proxies],
         [proxy.record for proxy in proxies],
-        before.config if before else configuration.plain(configs[0]),
+        before.config if before else configs[0].plain(),
         sets[0].discount,
     )
 

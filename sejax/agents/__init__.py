@@ -25,8 +25,8 @@ from sejax.agents.buffers import rollout_buffer as rollout_buffer
 from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import registry, require, shortened
-from sejax.options.parts import require_part
+from sejax.options import ConfigError, registry, shortened
+from sejax.options.registry import require_part
 
 DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
 
@@ -63,6 +63,8 @@ def make_agent(
     """
     fix = "Set task to env.task, or sejax.Task(name=..., env=env)."
     require_part("task", TaskSpec, task, fix)
+    require_part("agent", AgentConfig, config, "Pass an object, such as DDQNConfig().")
+    require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
     is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
     return (_make_once if is_key else _make_agent)(config, exploration, task, varied)
@@ -84,7 +86,11 @@ _make_once = functools.cache(_make_agent)
 
 
 def require_fit(
-    agent: AgentConfig, exploration: ExplorationConfig, spec: TaskSpec, task_name: str
+    agent: AgentConfig,
+    exploration: ExplorationConfig,
+    spec: TaskSpec,
+    task_name: str,
+    field: str = "agent",
 ) -> None:
     """Checks that an agent can act in a task, and that it can explore so.
 
@@ -93,28 +99,23 @@ def require_fit(
       exploration: that of its intrinsic reward.
       spec: of the task.
       task_name: for messages.
+      field: of the agent, for messages.
 
     Raises:
       ConfigError: if it cannot.
     """
-    require_part("agent", AgentConfig, agent, "Pass an object, such as DDQNConfig().")
-    require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
-    agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
-        require(
-            False,
-            "agent",
-            f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
-            f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
+        must = f"{field} must be one of {', '.join(fitting)} in {task_name}, with {spec.states} "
+        must += (
+            f"states and {spec.actions} actions; got {shortened(registry.name_of('agent', agent))}"
         )
-    exploration_name = shortened(registry.name_of("exploration", exploration))
-    require(
-        exploration.states is None or agent.states in (None, exploration.states),
-        "exploration",
-        f"must be one for {agent.states} states with agent={shortened(agent_name)}; got "
-        f"{exploration_name}. Set exploration=none.",
-    )
+        raise ConfigError(f"{must}. Set agent={fitting[0]}.", field)
+    if exploration.states is not None and agent.states not in (None, exploration.states):
+        agent_name = shortened(registry.name_of("agent", agent))
+        exploration_name = shortened(registry.name_of("exploration", exploration))
+        must = f"exploration must be one for {agent.states} states with agent={agent_name}; got"
+        raise ConfigError(f"{must} {exploration_name}. Set exploration=none.", "exploration")
 
 
 def default_for(spec: TaskSpec) -> str:

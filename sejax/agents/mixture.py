@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
 from sejax.options import Options, one_of, option, require, shortened
-from sejax.options.parts import require_part
+from sejax.options.registry import require_part
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,12 +94,12 @@ class TaskSpec:
     @property
     def states(self) -> str:
         """Kind of the observations: "discrete" or "vector"."""
-        return "vector" if self.num_states is None else "discrete"
+        return "discrete" if isinstance(self.observation, Discrete) else "vector"
 
     @property
     def actions(self) -> str:
         """Kind of the actions: "discrete" or "continuous"."""
-        return "continuous" if self.num_actions is None else "discrete"
+        return "discrete" if isinstance(self.action, Discrete) else "continuous"
 
     @property
     def is_solvable(self) -> bool:

@@ -25,6 +25,7 @@ there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=12
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import os
 import re
@@ -268,17 +269,6 @@ def as_python(value: Any) -> Any:
 # --- rules ---------------------------------------------------------------------------------------
 
 
-def rule(holds: Callable[[T], bool], must: str, reason: str) -> Rule[T]:
-    """The rule that a predicate holds; see `require`."""
-
-    def apply(name: str, value: T, default: T | None) -> None:
-        if not holds(value):
-            got, fix = shortened(value), f"{name}={as_text(default)}"
-            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
-
-    return apply
-
-
 def as_text(value: object) -> str:
     """A value as the command line takes it.
 
@@ -294,16 +284,24 @@ def as_text(value: object) -> str:
     return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
 
 
-def between(low: float, high: float, reason: str, must: str = "") -> Rule[float]:
-    """A number from `low` to `high`."""
+def between(
+    low: float, high: float, reason: str, must: str = "", is_whole: bool = False
+) -> Rule[float]:
+    """A number from `low` to `high`, and a whole one with `is_whole`."""
     must = must or f"lie between {low:g} and {high:g}"
-    return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
+
+    def apply(name: str, value: float, default: float | None) -> None:
+        is_within = is_number(value) and low <= value <= high
+        if not is_within or (is_whole and value != value // 1):
+            got, fix = shortened(value), f"{name}={as_text(default)}"
+            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
+
+    return apply
 
 
 def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule[float]:
     """A whole number from `least` to `most`."""
-    must = f"be a whole number from {least} to {most}"
-    return rule(lambda x: is_number(x) and least <= x <= most and x == x // 1, must, reason)
+    return between(least, most, reason, f"be a whole number from {least} to {most}", is_whole=True)
 
 
 def not_negative(reason: str = "it is a size") -> Rule[float]:
@@ -311,29 +309,19 @@ def not_negative(reason: str = "it is a size") -> Rule[float]:
     return between(0, MOST, reason)
 
 
-def finite(reason: str) -> Rule[float]:
-    """A finite number, of either sign."""
-    return between(-MOST, MOST, reason)
-
-
 def positive(reason: str, at_most: float = MOST) -> Rule[float]:
     """A finite number above 0 with which programs can compute in 32 bits."""
     return between(LEAST, at_most, reason)
 
 
-def fraction() -> Rule[float]:
-    """A number in [0, 1]."""
-    return between(0, 1, "it is a fraction")
-
-
-def shrinks() -> Rule[float]:
-    """A factor in (0, 1]."""
-    return between(LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
-
-
-def seed() -> Rule[float]:
-    """A seed that `jax.random.key` takes as it is."""
-    return between(0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
+#: `finite(reason)` is a finite number, of either sign.
+finite = functools.partial(between, -MOST, MOST)
+#: `fraction()` is a number in [0, 1].
+fraction = functools.partial(between, 0, 1, "it is a fraction")
+#: `shrinks()` is a factor in (0, 1].
+shrinks = functools.partial(between, LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
+#: `seed()` is a seed that `jax.random.key` takes as it is.
+seed = functools.partial(between, 0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
 
 
 def one_of(known: Collection[str]) -> Rule[str]:

@@ -116,8 +116,8 @@ def fields_of(cls: type) -> dict[str, Any]:
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """Error for a field that is not there, with the nearest of those that are."""
     field, last = shortened(field, 40), field.rpartition(".")[2]
-    meant = SYMBOLS.get(last, last)
-    ranked = [name for name in known if name.rpartition(".")[2] == meant] or nearest(field, known)
+    usual = SYMBOLS.get(last, last)
+    ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f" Did you mean {ranked[0]}?" if ranked else ""
     is_no = "is no field any more" if last in GONE else "is no field"
     return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
@@ -238,7 +238,7 @@ def expanded(text: str) -> str:
       >>> expanded("ppo:~/model.zip") == "ppo:" + os.path.expanduser("~/model.zip")
       True
     """
-    return re.sub(r"(^|:|:///)~(?=/|$)", lambda found: found[1] + os.path.expanduser("~"), text)
+    return re.sub(r"(^|:|:///)~(?=/|$)", lambda match: match[1] + os.path.expanduser("~"), text)
 
 
 def unquoted(text: str) -> str:

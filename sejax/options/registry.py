@@ -28,22 +28,37 @@ may be is in `sejax.options.plain`.
 import copy
 import dataclasses
 import functools
-import importlib
 import importlib.metadata
-import importlib.util
 import inspect
-import operator
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Callable, Collection, Mapping
+from pkgutil import resolve_name
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_checkable
 
 from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
-if TYPE_CHECKING:
-    from sejax.options.parts import Makes
-
+PASS_AN_OBJECT = "Pass an object; sejax.config([...]) takes names."
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
+
+
+@runtime_checkable
+class Makes(Protocol[T_co]):
+    """A configuration that makes a part, of a task or of whatever such a part is for."""
+
+    @property
+    def make(self) -> Callable[..., T_co]: ...
+
+
+@runtime_checkable
+class RunConfig(Protocol):
+    """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
+
+    @property
+    def generations(self) -> int: ...
+
+    def parts(self) -> dict[str, Any]: ...
 
 
 class Group(NamedTuple):
@@ -80,7 +95,7 @@ GROUPS = {
     "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config",)),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
-# Names that come with sejax.
+# Names that come with sejax; the first of a group is the choice where nothing else makes one.
 BUILT_IN = {
     "env": {
         "cartpole": "sejax.envs.classic:CartPole",
@@ -110,24 +125,24 @@ BUILT_IN = {
         "q_learning": "sejax.agents.tabular:QLearningConfig",
         "sarsa": "sejax.agents.tabular:SARSAConfig",
     },
+    "proxy": {
+        "se": "sejax.proxies.synthetic:SyntheticConfig",
+        "rn": "sejax.proxies.reward:RewardConfig",
+    },
     "exploration": {
         "none": "sejax.agents.base:NoExploration",
         "icm": "sejax.agents.exploration:ICMConfig",
         "count_based": "sejax.agents.exploration:CountBasedConfig",
     },
-    "proxy": {
-        "se": "sejax.proxies.synthetic:SyntheticConfig",
-        "rn": "sejax.proxies.reward:RewardConfig",
+    "es": {
+        "nes": "sejax.es.nes:NESConfig",
+        **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
     },
     "objective": {
         "max_reward": "sejax.objectives:MaxReward",
         "reward_threshold": "sejax.objectives:RewardThreshold",
         "auc": "sejax.objectives:AUC",
         "auc_sum": "sejax.objectives:AUCSum",
-    },
-    "es": {
-        "nes": "sejax.es.nes:NESConfig",
-        **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
     },
     "tracker": {
         "none": "sejax.runs.trackers:NoTracker",
@@ -145,7 +160,7 @@ PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymn
 
 def names(group: str) -> list[str]:
     """The registered names: those that come with sejax, then those of installed packages."""
-    return [*BUILT_IN[group], *_offered(group)]
+    return [*_paths(group)]
 
 
 def is_registered(group: str, name: str) -> bool:
@@ -166,60 +181,50 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
         attribute that is no plugin.
     """
     if name in BUILT_IN[group]:
-        return _attribute(BUILT_IN[group][name])
+        return resolve_name(BUILT_IN[group][name])
     path = _path_of(group, name)
-    if path is None and ":" in name:
-        path = name
-        require_typed(group, path, imports)
+    if path is None and ":" not in name:
+        raise unknown_name(group, name, [*names(group), *_suggestions(name)])
     if path is None:
-        raise unknown_name(group, name, [*names(group), *_meant(name)])
-    cls = _as_dataclass(group, name, imported(group, path))
-    if f"{cls.__module__}:{cls.__qualname__}" != name:
-        _NAMES[cls] = name
-    return cls
+        require_typed(group, name, imports)
+    plugin = imported(group, path or name)
+    if inspect.isfunction(plugin):
+        plugin = _from_function(group, name, plugin)
+    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
+    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
+    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
+    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
+    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
+    require(is_fit, group, f"{must} {shortened(plugin)}.")
+    if f"{plugin.__module__}:{plugin.__qualname__}" != name:
+        _NAMES[plugin] = name
+    return plugin
 
 
-def name_of(group: str, config: "Makes[Any]") -> str:
+def name_of(group: str, config: Makes[Any]) -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
-    if _is_one_of_many(cls):
+    if "name" in getattr(cls, "__dataclass_fields__", ()):  # the class has a family of names
         return str(config.name)  # type: ignore[attr-defined]
     path = f"{cls.__module__}:{cls.__qualname__}"
     built_in = {path: name for name, path in BUILT_IN[group].items()}
     return _NAMES.get(cls) or built_in.get(path, path)
 
 
-def paths_in(words: Iterable[str]) -> list[str]:
-    """Each `module:attribute` in words.
-
-    Example:
-      >>> paths_in(["env=mine:Room", "agents=[ddqn,mine:A]", "proxy=hf://me/se", "storage=x://a:b@c"])
-      ['mine:Room', 'mine:A']
-    """
-    path = r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])"
-    return [match for word in words for match in re.findall(path, word)]
-
-
 _NAMES: dict[type, str] = {}  # of classes that were found by another name than their path
 
 
 @functools.cache
-def _offered(group: str) -> dict[str, str]:
-    """Entry points of installed packages; a name of sejax's own cannot be taken over."""
+def _paths(group: str) -> dict[str, str]:
+    """The `module:attribute` of each registered name; sejax's own cannot be taken over."""
     points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
-    return {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
+    return BUILT_IN[group] | {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
 
 
 def _path_of(group: str, name: str) -> str | None:
     """The `module:attribute` that a registered name stands for."""
-    prefixes = PREFIXES if group == "env" else {}
-    by_prefix = (path for start, path in prefixes.items() if name.startswith(start))
-    return (BUILT_IN[group] | _offered(group)).get(name) or next(by_prefix, None)
-
-
-def _is_one_of_many(cls: type) -> bool:
-    """Whether a class has a family of names, so that the name is one of its fields."""
-    return dataclasses.is_dataclass(cls) and "name" in fields_of(cls)
+    by_prefix = PREFIXES.get(name[: name.find("/") + 1]) if group == "env" else None
+    return _paths(group).get(name, by_prefix)
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -244,8 +249,8 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
     require(is_choice, group, message)
     cls = find(group, values["name"], imports)
-    fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
     known = fields_of(cls)
+    fields = {k: v for k, v in values.items() if k != "name" or k in known}
     for field in [name for name in fields if name not in known]:
         others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
         message = f"is a field of {group}={', '.join(others)}. Set one of them."
@@ -253,30 +258,40 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
     return from_plain(cls, fields, group, imports)
 
 
-def describe(group: str, config: "Makes[Any]") -> dict[str, Any]:
+def describe(group: str, config: Makes[Any]) -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
 
 
-def make(group: str, config: "Makes[T]", *arguments: Any) -> T:
+@overload
+def make(group: str, config: Makes[T], *arguments: Any) -> T: ...
+@overload
+def make(group: str, config: T | Makes[T], *arguments: Any) -> T: ...
+def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     """What a configuration configures, built once for equal configurations and arguments.
 
     Compiled programs are cached by the identity of what they were built from, so that a new
     instance would compile again. A configuration that cannot be hashed is equal to itself alone.
 
+    Args:
+      group: one of `GROUPS`.
+      config: the configuration; or what it configures, which is returned.
+      *arguments: of `Makes.make`.
+
     Raises:
-      ConfigError: if it makes something of another kind, or cannot be made.
+      ConfigError: if it is neither, makes something of another kind, or cannot be made.
     """
+    cls = resolve_name(GROUPS[group].makes)
+    if isinstance(config, cls) or not isinstance(config, Makes):
+        return require_part(group, cls, config)
     key = (group, config if is_hashable(config) else id(config), *arguments)
-    if key in _PARTS:
-        part: T = _PARTS[key][1]
-    else:
-        part, cls = config.make(*arguments), _attribute(GROUPS[group].makes)
-        name = shortened(name_of(group, config))
-        message = f"must make a sejax.{cls.__name__}; got {type(part).__name__} from {name}."
-        require(isinstance(part, cls), group, message)
+    if key not in _PARTS:
+        part = config.make(*arguments)
+        if not isinstance(part, cls):
+            got = f"{type(part).__name__} from {shortened(name_of(group, config))}"
+            raise ConfigError(f"{group} must make a sejax.{cls.__name__}; got {got}.", group)
         _PARTS[key] = config, part  # with config, its id stays its own
-    return part
+    return cast(T, _PARTS[key][1])
 
 
 _PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
@@ -291,24 +306,18 @@ def is_hashable(config: object) -> bool:
     return True
 
 
-def require_package(group: str, config: "Makes[Any]") -> None:
-    """Checks that the package which a plugin names as its `package` is there; imports nothing.
+def require_part(group: str, cls: type[T], part: object, fix: str = PASS_AN_OBJECT) -> T:
+    """The part, if it is one of this class.
 
     Raises:
-      ConfigError: if it is not.
+      ConfigError: for anything else.
     """
-    package, name = getattr(config, "package", None), name_of(group, config)
-    is_there = package is None or importlib.util.find_spec(package) is not None
-    message = f"must be installed; got {name} without the package {package}. Install it with pip"
-    require(is_there, group, f"{message} install 'sejax[{name}]'.")
+    got = shortened(repr(part))
+    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; got {got}. {fix}")
+    return cast(T, part)
 
 
 # --- plugins -------------------------------------------------------------------------------------
-
-
-def _attribute(path: str) -> Any:
-    module, _, attribute = path.partition(":")
-    return operator.attrgetter(attribute)(importlib.import_module(module))
 
 
 def require_path(field: str, path: str) -> None:
@@ -319,12 +328,12 @@ def require_path(field: str, path: str) -> None:
     """
     module, _, attribute = path.partition(":")
     is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
-    got, fix = (shortened(x, 60) for x in (path, *_meant(path), "my_module:MyClass")[:2])
+    got, fix = (shortened(x, 60) for x in (path, *_suggestions(path), "my_module:MyClass")[:2])
     message = f"must be a name or module:attribute; got {got}. Set {field}={fix}."
     require(is_path and not module.endswith(".py"), field, message)
 
 
-def _meant(text: str) -> list[str]:
+def _suggestions(text: str) -> list[str]:
     """The `module:attribute` that a dotted name or the path of a file may stand for."""
     match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
     return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []
@@ -339,25 +348,12 @@ def imported(field: str, path: str) -> Any:
     """
     require_path(field, path)
     try:
-        return _attribute(path)
+        return resolve_name(path)
     except Exception as error:
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
         got = shortened(path, 60)
         message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
         raise ConfigError(message, field) from error
-
-
-def _as_dataclass(group: str, name: str, plugin: Any) -> Any:
-    """The dataclass that a plugin is, or that a function stands for."""
-    base, arguments = _attribute(GROUPS[group].base), GROUPS[group].arguments
-    if inspect.isfunction(plugin):
-        return _from_function(group, name, plugin)
-    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
-    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
-    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
-    require(is_fit, group, f"{must} {shortened(plugin)}.")
-    return plugin
 
 
 @functools.cache
@@ -380,7 +376,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
         if not is_hashable(p.default):  # such as a list
             field = dataclasses.field(default_factory=functools.partial(copy.copy, p.default))
         fields.append((p.name, Any if p.annotation is p.empty else p.annotation, field))
-    base = _attribute(GROUPS[group].base)
+    base = resolve_name(GROUPS[group].base)
     bases = (base if issubclass(base, Options) else Options,)
     namespace = {"make": make, "__doc__": function.__doc__, "__module__": function.__module__}
     return dataclasses.make_dataclass(

@@ -18,7 +18,7 @@ from jaxtyping import Array, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
-from sejax.options import Options, as_text, require, shortened
+from sejax.options import ConfigError, Options, as_text, shortened
 
 # A reward or an entry of a state that networks make ends the episode beyond this; what is the real
 # task's own may be larger. It is far outside what networks of sane weights make, and small enough
@@ -69,11 +69,11 @@ class ProxyConfig(Options, ABC):
           ConfigError: if it is not.
         """
 
-    def _require(self, holds: object, name: str, value: object, why: str) -> None:
-        """Checks a field of which something else leaves one value; `why` follows that value."""
+    def _error(self, name: str, value: object, why: str) -> ConfigError:
+        """Error for a field of which something else leaves one value; `why` follows that value."""
         field, fix, got = f"{self.group}.{name}", as_text(value), as_text(getattr(self, name))
-        must = f"must be {fix} {shortened(why, 120)}"
-        require(holds, field, f"{must}; got {shortened(got)}. Set {field}={fix}.")
+        must = f"{field} must be {fix} {shortened(why, 120)}"
+        return ConfigError(f"{must}; got {shortened(got)}. Set {field}={fix}.", field)
 
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":

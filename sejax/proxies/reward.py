@@ -75,8 +75,8 @@ class RewardConfig(ProxyConfig):
         super().__post_init__()
         defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
         for name, default in defaults.items():
-            is_left = getattr(self, name) == default or not self.shaping.weighs_info
-            self._require(is_left, name, default, f"as {self.variant} has no network")
+            if getattr(self, name) != default and self.shaping.weighs_info:
+                raise self._error(name, default, f"as {self.variant} has no network")
 
     @property
     def shaping(self) -> Shaping:
@@ -94,9 +94,10 @@ class RewardConfig(ProxyConfig):
           ConfigError: if they do not.
         """
         why = f"where a step's info tells nothing of the state, as in {task_name}"
-        can_weigh = spec.info_keys or not self.shaping.weighs_info
-        self._require(can_weigh, "variant", "additive_potential", why)
-        self._require(spec.augmented_keys or not self.augmented, "augmented", False, why)
+        if self.shaping.weighs_info and not spec.info_keys:
+            raise self._error("variant", "additive_potential", why)
+        if self.augmented and not spec.augmented_keys:
+            raise self._error("augmented", False, why)
 
     def make(self, task: Task) -> "RewardEnv":
         """The RN of a task.

@@ -84,11 +84,11 @@ class SyntheticConfig(ProxyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        can_end = self.horizon is None or self.min_steps <= self.horizon
-        why = "or less, with a horizon of as many steps"
-        self._require(can_end, "min_steps", self.horizon, why)
-        is_known = self.is_bandit or self.reward_form == "network"
-        self._require(is_known, "reward_form", "network", "but with proxy.horizon=1")
+        if self.horizon is not None and self.min_steps > self.horizon:
+            why = "or less, with a horizon of as many steps"
+            raise self._error("min_steps", self.horizon, why)
+        if self.reward_form != "network" and not self.is_bandit:
+            raise self._error("reward_form", "network", "but with proxy.horizon=1")
 
     @property
     def is_bandit(self) -> bool:
@@ -105,8 +105,9 @@ class SyntheticConfig(ProxyConfig):
         Raises:
           ConfigError: if it is not.
         """
-        fits = self.reward_form == "network" or spec.num_actions is None
-        self._require(fits, "reward_form", "network", f"for discrete actions, as of {task_name}")
+        if self.reward_form != "network" and spec.num_actions is not None:
+            why = f"for discrete actions, as of {task_name}"
+            raise self._error("reward_form", "network", why)
 
     @property
     def reaches_step_limit(self) -> bool:

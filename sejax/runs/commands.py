@@ -17,7 +17,7 @@ import yaml
 
 from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.runs import compose, runtime
-from sejax.runs.config import CommandConfig, plain
+from sejax.runs.config import CommandConfig
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -45,7 +45,8 @@ def start(
         if {*HELP} & {*words}:
             print(help_text(overrides))
         elif configs_of and PRINT_CONFIG in words:
-            print(yaml.safe_dump_all(map(plain, configs_of(overrides)), sort_keys=False), end="")
+            configs = (config.plain() for config in configs_of(overrides))
+            print(yaml.safe_dump_all(configs, sort_keys=False), end="")
         else:
             main(overrides)
 
@@ -95,7 +96,7 @@ def messages() -> Iterator[None]:
         fail(str(error), FAILED)
     except OSError as error:
         message = f"A file could not be written or read: {error}. What was written before is whole"
-        fail(f"{message}; run the same command again to go on from there.", FAILED)
+        fail(f"{message}; run the same command again to resume from there.", FAILED)
     except Exception as error:
         if message := runtime.platform_error():
             fail(message, BAD_INPUT)

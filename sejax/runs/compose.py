@@ -1,14 +1,20 @@
 """From the words that a user types to nested plain values: the first half of `runs.config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts. `compose` finds the choice of every group (the given one, else what the task and the proxy
-suggest), and lays the layers on each other: the choices, the preset or what a stored proxy was
-learned with, and the words. Whether their names are fields of the choices shows when dataclasses
-are made of them.
+texts; `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
+every group (that of a word, else what the task and the proxy suggest), and lays the layers on each
+other: the choices, the preset or what a stored proxy was learned with, and the words. Whether their
+names are fields of the choices shows when dataclasses are made of them.
+
+sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset: values,
+`with_agent`, `with_es` and `with_objective` for those that only hold with one of these, and `like`
+for a section that it builds on, of its file or of `bases.yaml`. `general-<proxy>.yaml` serves tasks
+without a file of their own, and sections that say `like: general`. A user's file holds overrides.
 """
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import re
@@ -16,23 +22,25 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
+
 from sejax import agents, envs
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Options, as_text, registry, require, shortened
-from sejax.options.plain import expanded, merge, parsed, split, unquoted
-from sejax.runs import preset_files
+from sejax.options import ConfigError, Options, listed, nearest, registry, require, shortened, told
+from sejax.options.plain import expanded, flatten, merge, split, unquoted
 
 # Choices where neither a word nor the task or the proxy makes one.
-DEFAULTS = {
-    "env": "cartpole",
-    "proxy": "se",
-    "exploration": "none",
-    "es": "nes",
-    "objective": "max_reward",
-    "tracker": "none",
-    "machines": "local",
-}
+DEFAULTS = {group: next(iter(x)) for group, x in registry.BUILT_IN.items() if group != "agent"}
+AGENTS = ("agent", "agents")  # the fields that choose them
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
+# A choice may stand beside its fields, as in config.yaml.
+CHOICES = {f"{group}.name": group for group in registry.GROUPS}
+# The text of sejax's own preset files, by their stems.
+FILES = sorted(Path(__file__).parents[1].glob("presets/*.yaml"))
+PRESETS = {path.stem: path.read_text(encoding="utf-8") for path in FILES}
+BASES, GENERAL = "bases", "general"  # what sections build on; presets of tasks without a file
+# What reading a file of YAML may raise.
+UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
 Layers = dict[str, Mapping[str, Any]]
 Config = TypeVar("Config", bound=Options)
 
@@ -58,7 +66,9 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             got, field = shortened(override), "an override"
-            message = f"{field} must read FIELD=VALUE; got {got}. Write {meant(overrides[i:])}."
+            message = (
+                f"{field} must read FIELD=VALUE; got {got}. Write {suggestion(overrides[i:])}."
+            )
             raise ConfigError(message, field)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
@@ -66,11 +76,11 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         message = "must be one value: brackets close and hold no space, and a comma outside of them"
         message += f" makes a sweep; got {shortened(text)}. Set {name}={fix}."
         require(not (others or is_open), name, message)
-        texts[name] = text
+        texts[CHOICES.get(name, name)] = text
     return texts
 
 
-def meant(overrides: Sequence[str]) -> str:
+def suggestion(overrides: Sequence[str]) -> str:
     """What may be meant by words of which the first is no FIELD=VALUE."""
     pattern = r"([-=\s]*)([^\s=]*)(?:[\s=]+([^\s=]+)(?!\S))?"
     dashes, name, value = re.findall(pattern, " ".join(overrides[:3]))[0]
@@ -87,23 +97,22 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
       ConfigError: as `words`, and for a file that cannot be read.
     """
-    given: dict[str, Any] = {_choice(k): unquoted(text) for k, text in words(overrides).items()}
-    if not given.get("preset", "").endswith(preset_files.ENDING):
-        return given
-    of_file = preset_files.read_file(Path(expanded(given.pop("preset"))))
-    if chosen := agents_of(given):  # in place of the file's
+    values: dict[str, Any] = {name: unquoted(text) for name, text in words(overrides).items()}
+    if not values.get("preset", "").endswith(".yaml"):
+        return values
+    path = Path(expanded(values.pop("preset")))
+    try:
+        flat = flatten(dict(yaml.safe_load(path.read_text(encoding="utf-8"))))
+    except UNREADABLE as error:
+        got = f"{shortened(path, 40)} ({told(error)})"
+        must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
+        raise ConfigError(must, "preset") from error
+    # An older run's config.yaml has null in the place of what it did not choose.
+    of_file = {CHOICES.get(k, k): x for k, x in flat.items() if k not in AGENTS or x is not None}
+    if chosen := agents_of(values):  # in place of the file's
         others = tuple(f"agents.{key}." for key in agents_of(of_file) if key not in chosen)
-        choices = ("agent", "agents")
-        of_file = {
-            k: x for k, x in of_file.items() if k not in choices and not k.startswith(others)
-        }
-    return {_choice(k): x for k, x in of_file.items()} | given
-
-
-def _choice(name: str) -> str:
-    """The name of a field; a choice may stand beside its fields, as `env.name` in config.yaml."""
-    group = name.removesuffix(".name")
-    return group if group in registry.GROUPS else name
+        of_file = {k: x for k, x in of_file.items() if k not in AGENTS and not k.startswith(others)}
+    return of_file | values
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -130,8 +139,8 @@ def swept(
     Args:
       overrides: of the sweep.
       make: makes a configuration of a run's words.
-      field: that names the folder. If it is given, each run has a folder in it.
-      folder_of: the folder of a configuration otherwise, given a name of what is swept.
+      field: that names the folder. If it is set, each run has a folder in it.
+      folder_of: the folder of a configuration otherwise, by a name of what is swept.
       known: fields that tell default folders apart already.
     """
     configs = []
@@ -161,32 +170,80 @@ def field_of(key: str, keys: Collection[str]) -> str:
     return f"agents.{key}" if len(keys) > 1 else "agent"
 
 
-def agents_of(given: Mapping[str, Any]) -> dict[str, str]:
+def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
     """The names of agents by their keys; empty where none is chosen.
 
     `agent=ddqn` and `agents=[ddqn,ppo]` choose them, and `agents.KEY.name=ddqn` by any key.
     """
     chosen: dict[str, str] = {}
-    for field in [name for name in ("agents", "agent") if name in given]:
-        names = parsed(str(given[field]))
-        names = [*map(as_text, names if isinstance(names, list) else [names])]
-        several = ",".join(dict.fromkeys([*chosen.values(), *names])) or "ddqn,ppo"
-        is_clear = names and not chosen and len({*names}) == len(names)
-        message = f"must name each agent once; got {shortened(given[field])}. Set agents="
+    for field in [name for name in ("agents", "agent") if name in values]:
+        text = str(values[field])
+        is_list = text.startswith("[") and text.endswith("]")
+        names = [unquoted(name) for name in split(text[1:-1] if is_list else text)]
+        several = ",".join(dict.fromkeys(filter(None, [*chosen.values(), *names]))) or "ddqn,ppo"
+        is_clear = all(names) and not chosen and len({*names}) == len(names)
+        message = f"must name each agent once; got {shortened(values[field])}. Set agents="
         require(is_clear, field, f"{message}[{shortened(several)}].")
         chosen = {key_of(name): name for name in names}
     by_key = re.compile(r"agents\.([\w-]+)\.name")
-    named = {match[1]: str(x) for name, x in given.items() if (match := by_key.fullmatch(name))}
+    named = {match[1]: str(x) for name, x in values.items() if (match := by_key.fullmatch(name))}
     return chosen | named
 
 
-def _default_agent(given: Mapping[str, Any], imports: Collection[str]) -> str:
-    """The agent of the task that words choose."""
-    fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
-    task = fields | {"name": given.get("env", DEFAULTS["env"])}
-    with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
-        return agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
-    return agents.DEFAULTS[0]
+# --- presets -------------------------------------------------------------------------------------
+
+
+@functools.cache
+def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+    """The presets of a task and proxy, by their names: its own, and what all tasks have.
+
+    What a section builds on is merged in. It stands before the section.
+    """
+    sections: dict[str, dict[str, Any]] = {"best": {}}
+    bases: dict[str, dict[str, Any]] = {}
+    for stem in (BASES, f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
+        known = bases | {GENERAL: sections["best"]}
+        for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
+            like = section.pop("like", None)
+            known[name] = merge(known[like] if like else {}, section)
+            (bases if stem == BASES else sections)[name] = known[name]
+    return sections
+
+
+def _of_preset(
+    values: Mapping[str, Any], chosen: Mapping[str, Any], names: Mapping[str, str], objective: str
+) -> dict[str, Any]:
+    """The settings of a preset for these choices, nested plain values.
+
+    Args:
+      values: by the names of words.
+      chosen: the choice of each group.
+      names: of the agents by their keys. What a section says of other groups beside an agent holds
+        where that is the only one.
+      objective: where neither a word nor the preset chooses one.
+
+    Raises:
+      ConfigError: for an unknown preset, or one that the task does not have.
+    """
+    preset = str(values.get("preset", "best"))
+    sections = sections_of(str(chosen["env"]), str(chosen["proxy"]))
+    if preset not in sections:
+        ranked = nearest(preset, sections)
+        must = f"preset must be one that {shortened(chosen['env'])} has ({listed(ranked)})"
+        got = f"got {shortened(preset)}. Did you mean preset={ranked[0]}?"
+        raise ConfigError(f"{must}; {got}", "preset")
+    section = sections[preset]
+    objective = values.get("objective", section.get("objective", {}).get("name", objective))
+    beside = {key: section.get("with_agent", {}).get(name, {}) for key, name in names.items()}
+    settings = merge(
+        {name: x for name, x in section.items() if not name.startswith("with_")},
+        section.get("with_es", {}).get(str(chosen["es"]), {}),
+        section.get("with_objective", {}).get(str(objective), {}),
+        *(beside.values() if len(beside) == 1 else ()),
+        {"objective": {"name": objective}, "preset": preset},
+    )
+    of_agents = {key: of_agent.get("agent", {}) for key, of_agent in beside.items()}
+    return {name: x for name, x in settings.items() if name != "agent"} | {"agents": of_agents}
 
 
 # --- layers --------------------------------------------------------------------------------------
@@ -205,49 +262,45 @@ def compose(
 
     Returns:
       The layers in the order in which one lies on another, nested plain values by where they come
-      from, and each `module:attribute` that the words name, which may be imported.
+      from, and what is typed: each `module:attribute` in it may be imported.
 
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    given = read(overrides)
-    imports = frozenset(registry.paths_in(overrides))
-    usual = DEFAULTS | {group: stored[group]["name"] for group in groups if group in stored}
-    chosen: dict[str, Any] = {group: given.get(group, usual[group]) for group in groups}
-    names = agents_of(given) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
+    values, texts = read(overrides), words(overrides).values()
+    typed = frozenset(x.strip("[]'\" ") for text in texts for x in split(text.strip("[]")))
+    names = agents_of(values) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
-        default = _default_agent(given, imports)
+        default = agents.DEFAULTS[0]
+        task = {name[4:]: x for name, x in values.items() if name.startswith("env.")}
+        task["name"] = values.get("env", DEFAULTS["env"])
+        with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
+            default = agents.default_for(envs.spec_of(registry.configure("env", task, typed)))
         names = {default: default}
-    preset, of_preset = str(given.get("preset", "best")), {}
-    if learns:
-        section = preset_files.section_of(preset, chosen["env"], chosen["proxy"])
-        objective = registry.find("proxy", chosen["proxy"], imports).default_objective
-        objective = section.get("objective", {}).get("name", objective)
-        chosen["objective"] = given.get("objective", objective)
-        of_preset = {"preset": preset} | preset_files.settings_of(section, chosen, names)
-    choices = {group: {"name": name} for group, name in chosen.items()}
-    layers = {
-        "default": choices | {"agents": {key: {"name": name} for key, name in names.items()}},
-        f"preset={preset}": of_preset,
-        "proxy": stored,
-        "typed": _nested(given, names, groups),
+    chosen: dict[str, Any] = {group: values.get(group, DEFAULTS[group]) for group in groups}
+    layers: Layers = {
+        "default": {group: {"name": name} for group, name in chosen.items()}
+        | {"agents": {key: {"name": name} for key, name in names.items()}}
     }
-    return layers, imports
+    if learns:
+        objective = registry.find("proxy", str(chosen["proxy"]), typed).default_objective
+        of_preset = _of_preset(values, chosen, names, objective)
+        layers[f"preset={of_preset['preset']}"] = of_preset
+    return layers | {"proxy": stored, "typed": _nested(values, names, groups)}, typed
 
 
 def _nested(
-    given: Mapping[str, Any], agents: Collection[str], groups: Collection[str]
+    values: Mapping[str, Any], keys: Collection[str], groups: Collection[str]
 ) -> dict[str, Any]:
     """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
     tree: dict[str, Any] = {}
-    for name, value in given.items():
-        group, _, field = name.partition(".")
-        if name in (*groups, "agent", "agents"):
+    for name, value in values.items():
+        if name in (*groups, *AGENTS):
             continue
+        group, _, field = name.partition(".")
         if group == "agent":
-            full, got = f"agents.{next(iter(agents))}.{field}", shortened(value)
-            is_clear = len(agents) == 1
-            require(is_clear, name, f"must be one agent's; got {got}. Set {full}={got}.")
+            full, got = f"agents.{next(iter(keys))}.{field}", shortened(value)
+            require(len(keys) == 1, name, f"must be one agent's; got {got}. Set {full}={got}.")
             name = full
         for part in reversed(name.split(".")):
             value = {part: value}

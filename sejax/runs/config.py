@@ -6,6 +6,7 @@ value read by its field's type; the dataclasses check themselves.
 """
 
 import dataclasses
+import importlib.util
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,8 +34,7 @@ from sejax.options import (
 )
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
 from sejax.proxies import ProxyConfig, header
-from sejax.runs import preset_files
-from sejax.runs.compose import DEFAULTS, Layers, agents_of, compose, field_of, key_of, read
+from sejax.runs import compose
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -55,7 +55,7 @@ class Share(Options):
     """An agent's part in a mixture: `agents.KEY.weight`.
 
     Attributes:
-      weight: share of the candidates that train it; with 0 it only judges incumbents
+      weight: share of the candidates that train it; with 0 it only judges the search mean
     """
 
     group: ClassVar[str] = "share"
@@ -94,14 +94,18 @@ class CommandConfig(Options):
         (agent,) = self.agents.values()
         return agent
 
-    def require_fit(self, key: str, spec: TaskSpec, task_name: str) -> None:
-        """Checks that one of the agents can act in a task.
-
-        Raises:
-          ConfigError: if it cannot.
-        """
-        with errors_of("agent", field_of(key, self.agents)):
-            agents.require_fit(self.agents[key], self.exploration, spec, task_name)
+    def plain(self) -> dict[str, Any]:
+        """Nested plain values, as in `config.yaml`; `sejax.save` keeps them with a proxy."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        for group in self.groups:
+            values[group] = registry.describe(group, values[group])
+        of_agents = {key: registry.describe("agent", x) for key, x in self.agents.items()}
+        mixture, weights = values.pop("mixture", None), values.pop("weights", ())
+        if len(of_agents) > 1 and mixture is not None:
+            for agent, weight in zip(of_agents.values(), weights, strict=True):
+                agent["weight"] = weight
+            of_agents |= to_plain(mixture)
+        return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
 
     def require_learning(
         self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
@@ -139,7 +143,7 @@ class LearnConfig(CommandConfig):
     """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
 
     Attributes:
-      weights: of the agents; equal if not given
+      weights: of the agents; equal if left out
       preset: settings that were measured (best) or published (paper)
       env: the real task
       proxy: what is learned: a synthetic environment (se) or a reward network (rn)
@@ -151,7 +155,7 @@ class LearnConfig(CommandConfig):
         each training.
       generations: n_o: steps of the outer loop.
       num_seeds: Independent runs, with seeds seed, seed + 1, ...
-      stop_when_solved: End a run at its first incumbent mean that reaches the solved threshold.
+      stop_when_solved: End a run when the search mean first reaches the solved score.
       checkpoint_every: generations between checkpoints
       run_dir: null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
 
@@ -159,7 +163,7 @@ class LearnConfig(CommandConfig):
       ConfigError: for parts that cannot work together.
     """
 
-    groups: ClassVar[tuple[str, ...]] = tuple(DEFAULTS)
+    groups: ClassVar[tuple[str, ...]] = tuple(compose.DEFAULTS)
     learns: ClassVar[bool] = True
 
     weights: tuple[float, ...] = option(())
@@ -180,18 +184,24 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        registry.require_package("tracker", self.tracker)
-        registry.require_package("machines", self.machines)
+        for group in ("tracker", "machines"):
+            package = getattr(getattr(self, group), "package", None)
+            if package is not None and importlib.util.find_spec(package) is None:
+                must = f"{group} must be installed; got {self.name(group)} without the package"
+                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
+                raise ConfigError(f"{must} {package}. {fix}.", group)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
-        is_score = not self.stop_when_solved or getattr(self.objective, "scores_are_returns", True)
-        message = f"must be false with objective={self.name('objective')}, whose scores are no"
-        require(is_score, "stop_when_solved", f"{message} returns. Set stop_when_solved=false.")
-        spec, task_name = envs.spec_of(self.env), self.name("env")
+        if self.stop_when_solved and not getattr(self.objective, "scores_are_returns", True):
+            must = f"must be false with objective={self.name('objective')}, whose scores are no"
+            message = f"stop_when_solved {must} returns. Set stop_when_solved=false."
+            raise ConfigError(message, "stop_when_solved")
+        spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
-        for key in self.agents:
-            self.require_fit(key, spec, task_name)
+        for key, agent in self.agents.items():
+            field = compose.field_of(key, self.agents)
+            agents.require_fit(agent, self.exploration, spec, task_name, field)
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
@@ -199,10 +209,6 @@ class LearnConfig(CommandConfig):
         if group == "agent":
             return JOINT.join(self.agents)
         return registry.name_of(group, getattr(self, group))
-
-    def plain(self) -> dict[str, Any]:
-        """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
-        return plain(self)
 
     def task(self) -> envs.Task:
         """The real task; it is built once."""
@@ -213,10 +219,10 @@ class LearnConfig(CommandConfig):
         task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
         learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
         names, weights = tuple(self.agents), self.weights
-        several = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
+        mixture = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
             "task": task,
-            "agent": several if len(learners) > 1 else learners[0],
+            "agent": mixture if len(learners) > 1 else learners[0],
             "proxy": registry.make("proxy", self.proxy, task),
             "es": self.es,
             "objective": registry.make("objective", self.objective, task),
@@ -243,7 +249,7 @@ class EvaluateConfig(CommandConfig):
     Attributes:
       proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
       env: the task, where proxy=real or the proxy's is your own
-      proxy_kind: my_module:MyProxy, where the proxy is of a kind of your own
+      proxy_kind: my_module:MyProxy, where the proxy is one of your own
       agent_hparams: as_learned: agents and exploration that the proxy was learned with, where no
         agent is named; default: the agent's; varied: drawn around them for each agent.
       training_from: How long agents train on the proxy. proxy: on an SE as it was learned with, on
@@ -296,20 +302,6 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     return _from_plain(LearnConfig, unsaid | dict(values), imports)
 
 
-def plain(config: CommandConfig) -> dict[str, Any]:
-    """A command's configuration as plain values; inverse of `learn_config`."""
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    for group in config.groups:
-        values[group] = registry.describe(group, values[group])
-    of_agents = {key: registry.describe("agent", x) for key, x in config.agents.items()}
-    mixture, weights = values.pop("mixture", None), values.pop("weights", ())
-    if len(of_agents) > 1 and mixture is not None:
-        for agent, weight in zip(of_agents.values(), weights, strict=True):
-            agent["weight"] = weight
-        of_agents |= to_plain(mixture)
-    return to_plain(values | {"agents": of_agents})  # type: ignore[no-any-return]
-
-
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
@@ -317,7 +309,7 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     is imported.
     """
     try:
-        return plain(learn_config(stored, {*map(str, flatten(plain(config)).values())}))
+        return learn_config(stored, {*map(str, flatten(config.plain()).values())}).plain()
     except ConfigError:
         return dict(stored)
 
@@ -325,34 +317,34 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
 def _from_plain(
     schema: type[Schema], values: Mapping[str, Any], imports: Collection[str] | None
 ) -> Schema:
-    objects, fields = dict(values), fields_of(schema)
-    several, single = objects.pop("agents", None) or {}, objects.pop("agent", None)
-    if single is not None:  # as an older file has it
-        several = {key_of(str(dict(single).get("name"))): single, **several}
-    is_map = isinstance(several, Mapping) and all(key == key_of(str(key)) for key in several)
-    message = f"must be agents by keys that are words; got {shortened(several)}. {FIX}"
-    require(is_map and several, "agents", message)
-    shared = {name: x for name, x in several.items() if not isinstance(x, Mapping)}
-    shared = shared if schema.learns else {}
-    keys, weights = sorted(several.keys() - shared.keys()), []
-    objects["agents"] = {}
+    """A command's configuration from nested plain values; see `learn_config`."""
+    parts, fields = dict(values), fields_of(schema)
+    by_key, only = parts.pop("agents", None) or {}, parts.pop("agent", None)
+    if only is not None:  # as an older file has it
+        by_key = {compose.key_of(str(dict(only).get("name"))): only, **by_key}
+    is_map = isinstance(by_key, Mapping) and all(key == compose.key_of(str(key)) for key in by_key)
+    message = f"must be agents by keys that are words; got {shortened(by_key)}. {FIX}"
+    require(is_map and by_key, "agents", message)
+    keys = sorted(k for k, x in by_key.items() if isinstance(x, Mapping) or not schema.learns)
+    parts["agents"], weights = {}, []
     for key in keys:
-        where, agent = field_of(shortened(key, 40), keys), several[key]
-        agent = dict(agent) if isinstance(agent, Mapping) else {}
+        field = compose.field_of(shortened(key, 40), keys)
+        agent = dict(by_key[key]) if isinstance(by_key[key], Mapping) else {}
         share = {k: agent.pop(k) for k in fields_of(Share) if schema.learns and k in agent}
-        weights.append(from_plain(Share, share, where).weight)
-        with errors_of("agent", where):
-            objects["agents"][key] = registry.configure("agent", agent, imports)
+        weights.append(from_plain(Share, share, field).weight)
+        with errors_of("agent", field):
+            parts["agents"][key] = registry.configure("agent", agent, imports)
     if schema.learns:
+        shared = {name: x for name, x in by_key.items() if name not in keys}
         mixture = from_plain(MixtureConfig, shared, "agents")
         is_idle = mixture == MixtureConfig() and {*weights} == {1.0}
         field = f"agents.{next(iter(shared), 'KEY.weight')}"
         require(len(weights) > 1 or is_idle, field, f"must come with several agents. {FIX}")
-        objects |= {"weights": weights, "mixture": mixture}
+        parts |= {"weights": weights, "mixture": mixture}
     for group in schema.groups:
-        objects[group] = registry.configure(group, objects.get(group, {}), imports)
-    config = from_plain(schema, {k: x for k, x in objects.items() if k in fields}, "", imports)
-    for name in [name for name in objects if name not in fields]:
+        parts[group] = registry.configure(group, parts.get(group, {}), imports)
+    config = from_plain(schema, {k: x for k, x in parts.items() if k in fields}, "", imports)
+    for name in [name for name in parts if name not in fields]:
         raise unknown_field(str(name), words_of(config))
     return config
 
@@ -378,15 +370,13 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-    require("proxy" in read(overrides), "proxy", message)
     return _composed(EvaluateConfig, overrides)[0]
 
 
-def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:
+def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, compose.Layers]:
     """A command's configuration of its words, and the layers that it comes from."""
-    stored = {} if schema.learns else _learned(read(overrides))
-    layers, imports = compose(overrides, schema.groups, schema.learns, stored)
+    stored = {} if schema.learns else _learned(compose.read(overrides))
+    layers, imports = compose.compose(overrides, schema.groups, schema.learns, stored)
     return _from_plain(schema, merge(*layers.values()), imports), layers
 
 
@@ -404,36 +394,38 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
         known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
         lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
-    if schema.learns:
-        lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]
+    if isinstance(config, LearnConfig):
+        presets = compose.sections_of(config.name("env"), config.name("proxy"))
+        lines += [f"  preset: {', '.join([*presets, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes: list[tuple[str, type]] = [("", schema), ("agents", MixtureConfig)]
     classes += [(name, type(x)) for name, x in vars(config).items()]
     for key, agent in config.agents.items():
-        classes += [(field_of(key, config.agents), cls) for cls in (Share, type(agent))]
+        classes += [(compose.field_of(key, config.agents), cls) for cls in (Share, type(agent))]
     sources = dict[str, str]()
     for layer, values in layers.items():
-        names = flatten(_as_words(values, config.agents))
-        sources |= dict.fromkeys(names, "" if layer == "default" else f" ({layer})")
-    values = flatten(_as_words(plain(config), config.agents))
+        source = "" if layer == "default" else f" ({layer})"
+        sources |= dict.fromkeys(_as_words(values, config.agents), source)
+    values = _as_words(config.plain(), config.agents)
     fields = {name: x for name, x in values.items() if not name.endswith(".name")}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
-    """Plain values with an only agent's as `agent`, as words have them."""
-    several = values.get("agents", {})
+    """Plain values by the names of words, where an only agent is `agent`."""
+    by_key = values.get("agents", {})
     rest = {name: x for name, x in values.items() if name != "agents"}
-    return rest | ({"agents": several} if len(agents) > 1 else {"agent": several.get(*agents, {})})
+    of_agents = {"agents": by_key} if len(agents) > 1 else {"agent": by_key.get(*agents, {})}
+    return flatten(rest | of_agents)
 
 
 def words_of(config: CommandConfig) -> dict[str, Any]:
     """The value of each field, by its name in words; that of a choice is its name."""
-    values = flatten(_as_words(plain(config), config.agents))
+    values = _as_words(config.plain(), config.agents)
     return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
 
 
-def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
+def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a proxy was learned with, as far as the agents of an evaluation have it.
 
     Where its words name no agent, they are all of the proxy's, with their exploration; of a file
@@ -444,9 +436,11 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
       ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
         tell its agents.
     """
-    source, hparams = str(given.get("proxy", "real")), given.get("agent_hparams")
+    message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
+    require("proxy" in values, "proxy", message)
+    source, hparams = str(values["proxy"]), values.get("agent_hparams")
     groups = "agent", "agents", "exploration"
-    words = {name: x for name, x in given.items() if name.partition(".")[0] in groups}
+    words = {name: x for name, x in values.items() if name.partition(".")[0] in groups}
     if source == "real":
         return {}
     field, got = next(iter(words), "").partition(".")[0], shortened(", ".join(words))
@@ -460,7 +454,7 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
         agents_there = header.agents_of(stored.config)
         for agent in agents_there.values():
             header.configured("agent", agent, source)
-        learned = {key_of(key): agent for key, agent in agents_there.items()}
+        learned = {compose.key_of(key): agent for key, agent in agents_there.items()}
     except ConfigError:  # of the proxy, which is said when it is loaded
         if hparams == "as_learned":
             raise
@@ -470,5 +464,5 @@ def _learned(given: Mapping[str, Any]) -> dict[str, Any]:
         return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
     default = agents.default_for(stored.spec)
     by_name = {x["name"]: x for x in learned.values()} if hparams is None else {}
-    names = agents_of(given) or {default: default}
+    names = compose.agents_of(values) or {default: default}
     return {"agents": {key: by_name.get(name, {"name": name}) for key, name in names.items()}}

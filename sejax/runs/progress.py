@@ -8,7 +8,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRe
 
 from sejax.bilevel import Bilevel
 from sejax.options import registry
-from sejax.runs import preset_files
+from sejax.runs import compose
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, Reporter
@@ -32,7 +32,7 @@ class RunProgress(Progress, Reporter):
 
     def __enter__(self) -> Self:
         env, proxy = self._config.name("env"), self._config.name("proxy")
-        if not preset_files.is_tuned(env, proxy):
+        if f"{env}-{proxy}" not in compose.PRESETS:
             self.say(
                 f"There are no tuned settings for env={env} with proxy={proxy}: these are general "
                 "ones, not tuned (docs/defaults.md)."

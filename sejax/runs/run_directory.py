@@ -66,7 +66,7 @@ class RunDirectory(Store):
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
         super().__init__(
             config.resolved_run_dir,
-            configuration.plain(config),
+            config.plain(),
             field=field,
             free=FREE_FIELDS,
             completed=lambda stored: configuration.completed(stored, config),

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from sejax.options import registry, told
-from sejax.options.parts import Makes
+from sejax.options.registry import Makes
 
 
 @dataclass(frozen=True, kw_only=True)

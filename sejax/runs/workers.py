@@ -296,7 +296,7 @@ def _on_cluster(
 
 def setup_of(config: LearnConfig) -> str:
     """What a worker must know of a run, as JSON: a text, by which it keeps what it has compiled."""
-    plain = configuration.plain(config)
+    plain = config.plain()
     # A worker need not have what it has no use for.
     needed = {name: x for name, x in plain.items() if name not in ("tracker", "machines")}
     return json.dumps([needed, runtime.versions()])

@@ -25,7 +25,7 @@ from optuna import distributions
 
 from sejax.options import ConfigError, as_text, is_number, nearest, require, shortened, told
 from sejax.options.plain import split
-from sejax.runs.preset_files import UNREADABLE
+from sejax.runs.compose import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a number: the override says exactly what was tried
