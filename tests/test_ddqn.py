@@ -13,7 +13,7 @@ from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
 from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"
 CONFIG = DDQNConfig(
     hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
     learning_rate=0.01, tau=0.1, discount=0.9,
@@ -28,13 +28,12 @@ DUELING = DuelingDDQNConfig(
 )  # fmt: skip
 # Layers in both streams, with a slope of each part; and streams that are their heads alone.
 DUELING_CASES = {
-    "prelu": replace(DUELING, activation="prelu", stream_num_layers=2),
-    "no_streams": replace(DUELING, stream_num_layers=0),
+    "dueling_prelu": replace(DUELING, activation="prelu", stream_num_layers=2),
+    "dueling_no_streams": replace(DUELING, stream_num_layers=0),
 }
-GOLDEN_UPDATES = [  # made by torch_ddqn.py and torch_dueling.py
-    *(("ddqn", case, config) for case, config in CASES.items()),
-    ("ddqn", "tanh", replace(CONFIG, activation="fast_tanh")),
-    *(("dueling", case, config) for case, config in DUELING_CASES.items()),
+GOLDEN_UPDATES = [
+    *(CASES | DUELING_CASES).items(),
+    ("tanh", replace(CONFIG, activation="fast_tanh")),
 ]
 
 
@@ -61,9 +60,9 @@ def nested_params(config):
 # --- updates against torch -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("agent_name", "case", "config"), GOLDEN_UPDATES)
-def test_updates_equal_torchs_on_the_same_batches(agent_name, case, config):
-    golden = np.load(GOLDEN / f"{agent_name}_updates.npz")
+@pytest.mark.parametrize(("case", "config"), GOLDEN_UPDATES)
+def test_updates_equal_torchs_on_the_same_batches(case, config):
+    golden = np.load(GOLDEN)  # made by torch_ddqn.py
     agent = DDQN(config, OBS_DIM, NUM_ACTIONS).agent()
     params = (golden[f"{case}/{name}/0"] for name in ("params", "target_params"))
     state, update = state_with(agent, *params), jax.jit(agent.update)

@@ -3,10 +3,20 @@
 import jax
 import torch
 from support import raveled
-from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, nested_params, random_batch
+from test_ddqn import (
+    CASES,
+    DUELING_CASES,
+    GOLDEN,
+    NUM_ACTIONS,
+    OBS_DIM,
+    nested_params,
+    random_batch,
+)
 from torch_networks import TorchMLP, follow, tensors, write_golden
 
 from sejax.agents.dqn import DDQN
+
+PARTS = ("features", "value", "advantage")
 
 
 class TorchDDQN:
@@ -44,16 +54,40 @@ class TorchDDQN:
         return {name: raveled(net.nested()) for name, net in nets.items()}
 
 
-def write(path, configs, make_reference):
-    """Writes parameters before, after one, and after five updates on the test's batches."""
-    references = {}
-    for case, config in configs.items():
-        agent, nested = DDQN(config, OBS_DIM, NUM_ACTIONS).agent(), nested_params(config)
-        params = agent.init(jax.random.key(1), agent.hparams).params
-        # Target and online network apart from the start, so that it shows which is used where.
-        references[case] = make_reference(nested(params), nested(params[::-1]), config)
-    write_golden(path, references, (0, 1, 5), lambda case, number: [random_batch(number)])
+class DuelingNet(torch.nn.Module):
+    """Each part is a network of its own, from the same parameters."""
+
+    def __init__(self, params, activation):
+        super().__init__()
+        self.parts = torch.nn.ModuleDict(
+            {name: TorchMLP(params[name], activation) for name in PARTS}
+        )
+
+    def forward(self, x):
+        features = self.parts["features"](x)
+        advantage = self.parts["advantage"](features)
+        return self.parts["value"](features) + advantage - advantage.mean(1, keepdim=True)
+
+    def nested(self):
+        """The parameters as the agent nests them."""
+        return {name: part.nested() for name, part in self.parts.items()}
+
+
+class TorchDuelingDDQN(TorchDDQN):
+    """The same with the dueling network."""
+
+    def network(self, params):
+        return DuelingNet(params, self.config.activation)
+
+
+def initial(case, config):
+    agent, nested = DDQN(config, OBS_DIM, NUM_ACTIONS).agent(), nested_params(config)
+    params = agent.init(jax.random.key(1), agent.hparams).params
+    # Target and online network apart from the start, so that it shows which is used where.
+    make = TorchDDQN if case in CASES else TorchDuelingDDQN
+    return make(nested(params), nested(params[::-1]), config)
 
 
 if __name__ == "__main__":
-    write(GOLDEN / "ddqn_updates.npz", CASES, TorchDDQN)
+    references = {case: initial(case, config) for case, config in (CASES | DUELING_CASES).items()}
+    write_golden(GOLDEN, references, (0, 1, 5), lambda case, number: [random_batch(number)])
