@@ -1,17 +1,15 @@
 """How fast sejax is on a GPU, beside the CPU of the same machine.
 
 Checks first: how far apart a tiny run is on both, whether the compiled program of a
-generation stays on the device and copies no large array, and how many kernels a step launches at
-least. Then figures: agent steps a second with more and more agents in one batch, generations of
-CartPole of 144 and of 4,096 candidates, ten thousand agents on the shipped SE, HalfCheetah on brax.
-No figure begins after `--minutes`, or if the one before tells that it would not end in time; the
-table says which are left out.
+generation stays on the device and copies no large array. Then figures: agent steps a second with
+more and more agents in one batch, generations of CartPole of 144 and of 4,096 candidates, ten
+thousand agents on the shipped SE. No figure begins after `--minutes`, or if the one before tells
+that it would not end in time; the table says which are left out.
 
-    pip install 'sejax[brax]' && python benchmarks/gpu.py --json gpu.json
+    python benchmarks/gpu.py --json gpu.json
 
 Without a GPU it measures the first device that there is. Seconds are wall-clock of the second call,
-compilation apart. Kernels are counted without a GPU, in the program that is lowered for CUDA: of
-the operations in the body of the training loop, those that XLA cannot fuse into their neighbours.
+compilation apart.
 """
 
 import argparse
@@ -22,7 +20,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -30,7 +27,6 @@ from typing import Any, NamedTuple
 
 import common
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import sejax
@@ -41,11 +37,6 @@ from sejax.training import TrainingConfig, make_trainer
 
 WIDTHS = (16, 64, 256, 1024, 4096, 16_384)  # agents in one batch
 STEPS = 512  # of an agent in the figures of throughput
-# Operations that start a kernel, or a call of a library, of their own.
-ALONE = (
-    *("dot_general", "convolution", "reduce", "reduce_window", "gather", "scatter", "sort"),
-    *("dynamic_update_slice", "custom_call", "rng_bit_generator", "cholesky", "triangular_solve"),
-)
 
 
 class World(NamedTuple):
@@ -76,13 +67,12 @@ def main() -> None:
     result: dict[str, Any] = {
         "machine": common.machine(("jax", "sejax")), "card": device.device_kind,
         "platform": device.platform, "checks": checks(device, cpu),
-        "kernels": {name: kernels(name, args) for name in agents_of(args)},
     }  # fmt: skip
     show_checks(result)
     rows = []
     for what, make, size in figures(args, device):
-        found = clock.measure(what, make, size)
-        rows.append({"what": what, "agents": size, "on": device.platform, **found})
+        figure = clock.measure(what, make, size)
+        rows.append({"what": what, "agents": size, "on": device.platform, **figure})
     result["figures"] = rows + (of_cpu(args) if has_card else [])
     show_figures(result)
     common.finish("gpu", args, result)
@@ -105,12 +95,8 @@ def of_cpu(args: argparse.Namespace) -> list[dict[str, Any]]:
             "--minutes",
             f"{args.minutes / 3}",
         ]
-        subprocess.run(
-            command,
-            env=os.environ | {"JAX_PLATFORMS": "cpu"},
-            stdout=subprocess.DEVNULL,
-            check=True,
-        )
+        on_cpu = os.environ | {"JAX_PLATFORMS": "cpu"}
+        subprocess.run(command, env=on_cpu, stdout=subprocess.DEVNULL, check=True)
         rows: list[dict[str, Any]] = json.loads(path.read_text())["figures"]
         return rows
 
@@ -157,55 +143,6 @@ def is_large(line: str) -> bool:
     return int(np.prod(sizes or [0])) >= 100_000
 
 
-def kernels(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Kernels of a training step of 64 agents side by side, at least, by operation.
-
-    They are those of the largest loop of the program; a loop within it counts once.
-    """
-    train, keys, params = training_of(name, 64, 8 if args.quick else STEPS)
-    traced = jax.jit(jax.vmap(train, (0, None))).trace(keys, params)
-    module = traced.lower(lowering_platforms=("cuda",)).compiler_ir()
-    functions = {x.attributes["sym_name"].value: x for x in module.body.operations}
-    loops = [count(loop, functions) for loop in loops_of(functions["main"], functions)]
-    largest = max(loops, key=lambda each: each.total(), default=Counter())
-    return {"a_step": largest.total(), "of": dict(largest.most_common())}
-
-
-def loops_of(op: Any, functions: dict[str, Any]) -> Iterator[Any]:
-    """The outermost loops below an operation."""
-    for inner in inside(op):
-        if name_of(inner) == "while":
-            yield inner
-        elif name_of(inner) == "call":
-            yield from loops_of(functions[inner.attributes["callee"].value], functions)
-        else:
-            yield from loops_of(inner, functions)
-
-
-def count(op: Any, functions: dict[str, Any]) -> Counter[str]:
-    """The operations of `ALONE` below an operation."""
-    found: Counter[str] = Counter()
-    for inner in inside(op):
-        name = name_of(inner)
-        if name in ALONE:
-            found[name] += 1
-        elif name == "call":
-            found += count(functions[inner.attributes["callee"].value], functions)
-        else:
-            found += count(inner, functions)
-    return found
-
-
-def inside(op: Any) -> Iterator[Any]:
-    for region in op.regions:
-        for block in region:
-            yield from block.operations
-
-
-def name_of(op: Any) -> str:
-    return str(op.operation.name).partition(".")[2]
-
-
 # --- figures -------------------------------------------------------------------------------------
 
 
@@ -239,8 +176,6 @@ def figures(args: argparse.Namespace, device: Any) -> Iterator[tuple[str, Make, 
     many = 10_000
     on_se = partial(throughput, "PPO", many, steps)
     yield "agents on the shipped SE of CartPole", on_device(on_se), many
-    for width in (16, 256):
-        yield "steps of HalfCheetah on brax", on_device(partial(cheetah, width)), width
 
 
 def compiled(device: Any, parts: Callable[[], tuple[Callable[..., Any], tuple[Any, ...]]]) -> Make:
@@ -292,24 +227,6 @@ def generation(size: int) -> Any:
     return (lambda state: bilevel.generation(state)[1].train_steps.sum()), (state,)
 
 
-def cheetah(num: int) -> Any:
-    """Steps of so many robots side by side, random actions."""
-    task = sejax.envs.make("halfcheetah", backend="mjx")
-
-    def one(key: jax.Array) -> Any:
-        _, state = task.env.reset_env(key, task.params)
-
-        def step(state: Any, key: jax.Array) -> Any:
-            action = jax.random.uniform(key, (task.action_dim,), minval=-1.0, maxval=1.0)
-            obs, state, *_ = task.env.step_env(key, state, action, task.params)
-            return state, jnp.isfinite(obs).all()
-
-        return jax.lax.scan(step, state, jax.random.split(key, 50))[1].sum()
-
-    keys = jax.random.split(jax.random.key(0), num)
-    return (lambda keys: jax.vmap(one)(keys).sum()), (keys,)
-
-
 class Clock:
     """Measures as long as there is time.
 
@@ -349,9 +266,6 @@ class Clock:
 def show_checks(result: dict[str, Any]) -> None:
     for name, value in result["checks"].items():
         print(f"{name.replace('_', ' ')}: {value:g}")
-    rows = [[name, each["a_step"], ", ".join(f"{n} {op}" for op, n in each["of"].items())]
-            for name, each in result["kernels"].items()]  # fmt: skip
-    common.print_table("Kernels of an agent step, at least", ["agent", "kernels", "of"], rows)
 
 
 def show_figures(result: dict[str, Any]) -> None:
