@@ -9,7 +9,7 @@ A copy of the policy, a small network, becomes the reward of a one-step SE. With
 ones are found by augmented random search: the best of each part of the search becomes an SE,
 students train on each, and the SE that teaches best is kept. Other fields are those of sejax.run
 with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv into run_dir;
-the same command goes on where it was stopped.
+the same command resumes where it was stopped.
 """
 
 import dataclasses
@@ -88,7 +88,7 @@ def main(overrides: Sequence[str]) -> None:
     try:
         distill(job, config, folder, shlex.join(overrides))
     except KeyboardInterrupt as stop:
-        commands.interrupted(f"Interrupted. The same command goes on from {folder}.", stop)
+        commands.interrupted(f"Interrupted. The same command resumes from {folder}.", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:

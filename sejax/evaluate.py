@@ -138,7 +138,7 @@ def spread(mean: float, std: float, digits: int) -> str:
 def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
     task = setup.task
     (first, *others) = config.agents
-    who = "agents of each kind" if others else f"{first} agents"
+    who = "agents of each algorithm" if others else f"{first} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

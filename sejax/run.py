@@ -6,7 +6,7 @@ real dynamics (proxy=rn), from agents trained on nothing else.
   python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
   python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
 
-The same command on the same run_dir goes on where it stopped. --print-config prints the
+The same command on the same run_dir resumes where it stopped. --print-config prints the
 configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
@@ -67,7 +67,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     and SIGTERM leave at once, with exit codes 130 and 143: finished generations are saved.
 
     Returns:
-      The best incumbent score of each.
+      The best search mean of each.
 
     Raises:
       ConfigError: if a run directory cannot be used.
@@ -75,30 +75,30 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
       OSError: if a file cannot be written; everything saved before is whole.
     """
     scores, diverged = [], []
-    with contextlib.ExitStack() as machines:
+    with contextlib.ExitStack() as contexts:
         compiled = None
         for config in configs:
             with RunDirectory(config) as directory, RunProgress(config) as progress:
                 try:
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:
-                        machines.close()
+                        contexts.close()
                         runtime.configure_jax()
-                        chunks = machines.enter_context(config.machines.make(config))
+                        chunks = contexts.enter_context(config.machines.make(config))
                         compiled = program
                     summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     progress.stop()
                     saved = f"{directory.finished_generations} generations are saved"
-                    message = f"Interrupted. {saved} in {directory.path}; the same command goes on"
+                    message = f"Interrupted. {saved} in {directory.path}; the same command resumes"
                     commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if summary["ended"] == "diverged":
                     diverged.append(directory.path)
                 elif len(configs) == 1:
-                    progress.finish(directory, chunks.learner, scores[-1])
+                    progress.finish(directory, chunks.bilevel, scores[-1])
     if len(configs) > 1:
-        print("Best incumbent scores:")
+        print("Best search means:")
         for config, score in zip(configs, scores, strict=True):
             print(f"{score:10.1f}  {config.resolved_run_dir}")
     if diverged:

@@ -3,7 +3,7 @@
   python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
   python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
 
-The same command goes on where it stopped, or is one more worker of the same study. Searched are
+The same command resumes where it stopped, or is one more worker of the same study. Searched are
 choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
 tag(log, inverse, ...) in 1 - x. Other overrides than the fields below are those of
 python -m sejax.run.
@@ -39,16 +39,16 @@ def main(overrides: Sequence[str]) -> None:
         must = f"search_dir must hold a database that can be used; got {got}"
         raise ConfigError(f"{must}. Set search_dir=FOLDER.", "search_dir") from error
     except KeyboardInterrupt as stop:
-        saved = f"What has ended is saved in {search.folder}; the same command goes on from there."
+        saved = f"What has ended is saved in {search.folder}; the same command resumes from there."
         commands.interrupted(f"Interrupted. {saved}", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
-    from sejax.searching.config import SearchConfig
+    from sejax.searching.config import StudyConfig
 
-    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)], {})
+    lines = field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})
     return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 

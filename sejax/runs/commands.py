@@ -95,7 +95,7 @@ def messages() -> Iterator[None]:
         fail(str(error), FAILED)
     except OSError as error:
         message = f"A file could not be written or read: {error}. What was written before is whole"
-        fail(f"{message}; run the same command again to go on from there.", FAILED)
+        fail(f"{message}; run the same command again to resume from there.", FAILED)
     except Exception as error:
         if message := runtime.platform_error():
             fail(message, BAD_INPUT)

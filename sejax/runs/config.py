@@ -55,7 +55,7 @@ class Share(Options):
     """An agent's part in a mixture: `agents.KEY.weight`.
 
     Attributes:
-      weight: share of the candidates that train it; with 0 it only judges incumbents
+      weight: share of the candidates that train it; with 0 it only judges search means
     """
 
     group: ClassVar[str] = "share"
@@ -151,7 +151,7 @@ class LearnConfig(CommandConfig):
         each training.
       generations: n_o: steps of the outer loop.
       num_seeds: Independent runs, with seeds seed, seed + 1, ...
-      stop_when_solved: End a run at its first incumbent mean that reaches the solved threshold.
+      stop_when_solved: End a run at its first search mean that reaches the solved threshold.
       checkpoint_every: generations between checkpoints
       run_dir: null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
 

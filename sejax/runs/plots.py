@@ -45,14 +45,14 @@ def learning_curve(
             lines, figsize=(7, 2.5 + 1.5 * lines), sharex=True, height_ratios=(2, 1)[:lines]
         )
         top, bottom = figure.axes[0], figure.axes[-1]
-        label = "incumbent: mean and std over fresh agents"
+        label = "search mean: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
         for agent, color in zip(agents, itertools.cycle(AGENTS)):
             style: dict[str, Any] = {"color": color, "lw": 1.3, "ls": "-."}
-            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
+            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
             if lines > 1:
                 bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)
         if solved_score is not None:

@@ -58,7 +58,7 @@ class RunProgress(Progress, Reporter):
         means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents[1:] and agents)
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
-            f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
+            f"search mean {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
             f"{means and f' ({means})'}, best {values['best_so_far']:.1f}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
@@ -68,19 +68,19 @@ class RunProgress(Progress, Reporter):
         if not self.is_live:
             self.say(text)
 
-    def finish(self, directory: RunDirectory, learner: Bilevel, best: float) -> None:
+    def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        path, solved_score = directory.path, learner.solved_score
+        path, solved_score = directory.path, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
-        verdict = f"best incumbent score {best:.1f}"
-        if learner.scoring.objective.meaning:
-            verdict += f": {learner.scoring.objective.meaning}"
+        verdict = f"best search mean {best:.1f}"
+        if bilevel.scoring.objective.meaning:
+            verdict += f": {bilevel.scoring.objective.meaning}"
         if solved_score is not None:
             verdict = "solved" if is_solved else "not solved"
-            verdict += f": best incumbent mean {best:.1f}, solved at {solved_score:g}"
+            verdict += f": best search mean {best:.1f}, solved at {solved_score:g}"
         ending = "solved" if is_solved else "learned"
-        self.console.rule(f"{learner.proxy.task.name}: {ending}", align="left")
+        self.console.rule(f"{bilevel.proxy.task.name}: {ending}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"

@@ -1,4 +1,4 @@
-"""Following a run with other tools: TensorBoard, Weights & Biases, or one of your own.
+"""Following a run with other tools: TensorBoard, or one of your own.
 
 A tracker hears of each generation after the run directory has it. It adds nothing to a run and
 cannot stop it.
@@ -104,7 +104,7 @@ class GuardedTracker:
         except (Exception, SystemExit) as error:  # foreign code may raise anything
             if not self._has_failed:
                 name = registry.name_of("tracker", self._config)
-                self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
+                self._say(f"tracker={name} has failed; the run continues without. {told(error)}")
             self._has_failed = True
 
 
@@ -140,33 +140,3 @@ class TensorBoardConfig:
             writer.flush()
 
         return SimpleNamespace(on_generation=on_generation, close=writer.close)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WandbConfig:
-    """A run of Weights & Biases; offline with `WANDB_MODE=offline`."""
-
-    package: ClassVar[str] = "wandb"
-    project: str = "sejax"
-
-    def make(self, run: TrackedRun) -> Tracker:
-        import wandb
-
-        logged = wandb.init(
-            project=self.project,
-            name=run.folder.name,
-            id=run.id,
-            resume="allow",
-            dir=str(run.folder),
-            config=run.config,
-            # The console belongs to the progress line; by default wandb waits 90 s for a network.
-            settings=wandb.Settings(console="off", init_timeout=20),
-        )
-
-        def on_generation(info: FinishedGeneration) -> None:
-            values: dict[str, Any] = {"generation": info.generation, **info.values}
-            if info.scores.size:
-                values["population_scores"] = wandb.Histogram(info.scores)
-            logged.log(values, step=info.generation)
-
-        return SimpleNamespace(on_generation=on_generation, close=logged.finish)
