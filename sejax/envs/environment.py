@@ -7,8 +7,7 @@ imported when its spaces are asked for.
 """
 
 import dataclasses
-import functools
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -101,12 +100,10 @@ class Environment(Generic[State, Params]):
         info = {"discount": jax.lax.select(terminated, 0.0, 1.0)}
         return self.observe(state), state, reward, terminated, info
 
-    @functools.partial(jax.jit, static_argnames=("self",))
     def reset(self, key: Array, params: Params | None = None) -> tuple[Array, State]:
         """As `reset_env`; for loops that are not sejax's."""
-        return self.reset_env(key, self.default_params if params is None else params)
+        return _gymnax_class().reset(self, key, params)
 
-    @functools.partial(jax.jit, static_argnames=("self",))
     def step(
         self, key: Array, state: State, action: Array, params: Params | None = None
     ) -> tuple[Array, State, Array, Array, Array, dict[str, Array]]:
@@ -116,17 +113,7 @@ class Environment(Generic[State, Params]):
           `(obs, state, reward, terminated, truncated, info)`, whose `info` has the
           `final_observation` of the step.
         """
-        params = self.default_params if params is None else params
-        key_step, key_reset = jax.random.split(key)
-        next_obs, state, reward, terminated, info = self.step_env(key_step, state, action, params)
-        truncated = self.is_truncated(state, params)
-        obs, state = jax.tree.map(
-            functools.partial(jax.lax.select, terminated | truncated),
-            self.reset_env(key_reset, params),
-            (next_obs, state),
-        )
-        ends = {"terminated": terminated, "truncated": truncated, "final_observation": next_obs}
-        return obs, state, reward, terminated, truncated, {**info, **ends}
+        return _gymnax_class().step(self, key, state, action, params)
 
     def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
@@ -144,6 +131,12 @@ class Environment(Generic[State, Params]):
     @property
     def name(self) -> str:
         return type(self).__name__
+
+
+def _gymnax_class() -> Any:
+    from gymnax.environments.environment import Environment as GymnaxEnvironment
+
+    return GymnaxEnvironment
 
 
 def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space, Space]:
