@@ -35,7 +35,7 @@ from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
 Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
-BATCH, SHARE = 16, 4  # trainings in a batch whose width nothing says; least ones in a share
+BATCH = 16  # trainings in a share whose size nothing says
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
 
@@ -146,14 +146,13 @@ class RayConfig(Options):
 # --- shares of a generation -----------------------------------------------------------------------
 
 
-def portion_sizes(bilevel: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
-    """Trainings of each agent in a batch, and in a share, which is whole batches.
+def share_sizes(bilevel: Bilevel, num_parallel: int | None) -> list[int]:
+    """Trainings of each agent in a share, which is one batch.
 
     They are the same for any number of workers, because sums over batches of other widths round
     otherwise.
     """
-    widths = [num_parallel or width or BATCH for width in bilevel.evaluate.widths]
-    return [(width, width * -(-SHARE // width)) for width in widths]
+    return [num_parallel or width or BATCH for width in bilevel.evaluate.widths]
 
 
 class RemoteChunks(Chunks):
@@ -177,7 +176,7 @@ class RemoteChunks(Chunks):
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._compute = compute
-        self._sizes = [size for _, size in portion_sizes(self.bilevel, config.num_parallel)]
+        self._sizes = share_sizes(self.bilevel, config.num_parallel)
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, of which chunks of any length are made."""
@@ -309,9 +308,9 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
       ConfigError: if this machine has other versions of what decides the numbers.
     """
     (agent_index, trainings), started = share, time.process_time()
-    capacity, program = _programs(setup)[agent_index]
+    size, program = _programs(setup)[agent_index]
     # Filled up with copies, for which nothing is computed.
-    n, numbers = len(trainings.active), np.arange(capacity)
+    n, numbers = len(trainings.active), np.arange(size)
     trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
     outcome = program(dataclasses.replace(trainings, active=trainings.active & (numbers < n)))
     outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
@@ -320,7 +319,7 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
 
 @functools.lru_cache(maxsize=1)
 def _programs(setup: str) -> list[tuple[int, Any]]:
-    """Most trainings in a share, and the program that computes them, for each agent of a run."""
+    """The size of a share, and the program that computes one, for each agent of a run."""
     plain, expected = json.loads(setup)
     _use_one_core()
     if (versions := runtime.versions()) != expected:
@@ -332,8 +331,8 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
     config = configuration.learn_config(plain, imports=None)
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
-    def program_of(agent_index: int, width: int) -> Any:
-        spread = spread_over_devices(bilevel.evaluate.runs[agent_index], 1, width)
+    def program_of(agent_index: int, size: int) -> Any:
+        spread = spread_over_devices(bilevel.evaluate.runs[agent_index], 1, size)
 
         def evaluate(sent: Trainings) -> Outcome:
             key = jax.random.wrap_key_data(sent.key)
@@ -342,8 +341,8 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 
         return jax.jit(evaluate, compiler_options=compiler_options())
 
-    sizes = portion_sizes(bilevel, config.num_parallel)
-    return [(capacity, program_of(i, width)) for i, (width, capacity) in enumerate(sizes)]
+    sizes = share_sizes(bilevel, config.num_parallel)
+    return [(size, program_of(i, size)) for i, size in enumerate(sizes)]
 
 
 def _use_one_core() -> None:
