@@ -78,7 +78,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     with contextlib.ExitStack() as contexts:
         compiled = None
         for config in configs:
-            with RunDirectory(config) as directory, RunProgress(config) as progress:
+            with RunDirectory(config) as directory:
+                progress = RunProgress(config)
                 try:
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:
@@ -88,7 +89,6 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         compiled = program
                     summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
-                    progress.stop()
                     saved = f"{directory.finished_generations} generations are saved"
                     message = f"Interrupted. {saved} in {directory.path}; the same command resumes"
                     commands.interrupted(f"{message} from there.", stop)

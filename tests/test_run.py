@@ -198,7 +198,8 @@ def family_chunks():
 def learn_families(path, *words):
     """A session of a run with two families; returns the line that is printed of its last chunk."""
     config = sejax.config([*OWN, *words, f"run_dir={path}"])
-    with run_directory.RunDirectory(config) as directory, RunProgress(config) as report:
+    report = RunProgress(config)
+    with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, family_chunks(), report)
 
 

@@ -7,7 +7,7 @@ imported when its spaces are asked for.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,6 @@ from jaxtyping import Array, Bool
 
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
 from sejax.options import ConfigError, shortened
-
-if TYPE_CHECKING:
-    from gymnax.environments.spaces import Space as GymnaxSpace
 
 
 @struct.dataclass
@@ -115,11 +112,11 @@ class Environment(Generic[State, Params]):
         """
         return _gymnax_class().step(self, key, state, action, params)
 
-    def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def observation_space(self, params: Params | None = None) -> Any:
         """gymnax's `Box` or `Discrete`."""
         return _as_gymnax(spaces_of(self)[0])
 
-    def action_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def action_space(self, params: Params | None = None) -> Any:
         """gymnax's `Box` or `Discrete`."""
         return _as_gymnax(spaces_of(self)[1])
 
@@ -153,7 +150,7 @@ def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space,
         return _of_gymnax(spaces[0], "observations"), _of_gymnax(spaces[1], "actions")
 
 
-def _as_gymnax(space: Space) -> "GymnaxSpace":
+def _as_gymnax(space: Space) -> Any:
     from gymnax.environments import spaces
 
     if isinstance(space, Discrete):
@@ -162,7 +159,7 @@ def _as_gymnax(space: Space) -> "GymnaxSpace":
     return spaces.Box(low, high, low.shape, jnp.float32)
 
 
-def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
+def _of_gymnax(space: Any, what: str) -> Space:
     from gymnax.environments import spaces
 
     if isinstance(space, spaces.Discrete):
