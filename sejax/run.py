@@ -89,7 +89,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         compiled = program
                     summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
-                    saved = f"{directory.finished_generations} generations are saved"
+                    saved = f"{len(directory.rows)} generations are saved"
                     message = f"Interrupted. {saved} in {directory.path}; the same command resumes"
                     commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))

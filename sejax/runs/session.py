@@ -52,12 +52,12 @@ def run(
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn = time.monotonic()
-    folder, first = directory.path.resolve(), directory.finished_generations
+    folder, first = directory.path.resolve(), len(directory.rows)
     tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
     guarded = GuardedTracker(config.tracker, tracked, report.say)
     with contextlib.closing(guarded) as tracker:
         while (ended := _ended(config, directory, bilevel, state)) is None:
-            first = directory.finished_generations
+            first = len(directory.rows)
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
@@ -73,7 +73,7 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    generations, agents = directory.finished_generations, bilevel.strategy.num_evaluations
+    generations, agents = len(directory.rows), bilevel.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
@@ -99,7 +99,7 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: Reporter)
     state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
     if restored is not None:
-        report.say(f"Resuming at generation {directory.finished_generations} of {directory.path}.")
+        report.say(f"Resuming at generation {len(directory.rows)} of {directory.path}.")
         here, there = runtime.versions(), directory.versions
         if there != here:
             report.say(f"It was made with {there}; here are {here}. Numbers may move.")
@@ -119,7 +119,7 @@ def _ended(
         return "solved"
     if _all_diverged(directory, bilevel):
         return "diverged"
-    return "finished" if directory.finished_generations >= config.generations else None
+    return "finished" if len(directory.rows) >= config.generations else None
 
 
 def _advance(
