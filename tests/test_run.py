@@ -22,7 +22,6 @@ from sejax.runs import commands, run_directory, runtime, session, workers
 from sejax.runs import config as configuration
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
-from sejax.runs.trackers import Reporter
 
 OWN = [*ROOM, "seed=12"]
 TINY = [*OWN, "agent.learning_rate=0.5"]
@@ -38,11 +37,12 @@ def chunks(*words):
     return workers.make_chunks(sejax.config([*TINY, *words]))
 
 
-class Report(Reporter):
+class Report(RunProgress):
     """Keeps the messages."""
 
-    def __init__(self):
+    def __init__(self, config):
         self.said = []
+        super().__init__(config)
 
     def say(self, text):
         self.said.append(text)
@@ -51,7 +51,7 @@ class Report(Reporter):
 def learn(path, *words, program=()):
     """A session of a run, as `sejax.run` has it; returns its messages."""
     config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
-    report = Report()
+    report = Report(config)
     with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, chunks(*program), report)
     return "\n".join(report.said)

@@ -1,6 +1,5 @@
 """The picture of a run."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from matplotlib.figure import Figure
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
-AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
@@ -45,8 +43,8 @@ def learning_curve(
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
-        for agent, color in zip(agents, itertools.cycle(AGENTS)):
-            style: dict[str, Any] = {"color": color, "lw": 1.3, "ls": "-."}
+        for i, agent in enumerate(agents):
+            style: dict[str, Any] = {"color": f"C{i}", "lw": 1.3, "ls": "-."}
             top.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
             if lines > 1:
                 bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)

@@ -7,14 +7,20 @@ from sejax.options import registry
 from sejax.runs import preset_files
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
-from sejax.runs.trackers import FinishedGeneration, Reporter
+from sejax.runs.trackers import FinishedGeneration
 
 
-class RunProgress(Reporter):
-    """Prints a line for each generation; the first one where settings are not tuned for a task."""
+class RunProgress:
+    """Prints a line for each generation; the first one where settings are not tuned for a task.
 
-    def __init__(self, config: LearnConfig):
+    Args:
+      config: of the run.
+      is_quiet: whether nothing is printed.
+    """
+
+    def __init__(self, config: LearnConfig, is_quiet: bool = False):
         self._config, self._started, self._steps = config, time.monotonic(), 0
+        self._is_quiet = is_quiet
         env, proxy = config.name("env"), config.name("proxy")
         if not preset_files.is_tuned(env, proxy):
             self.say(
@@ -29,7 +35,8 @@ class RunProgress(Reporter):
 
     def say(self, text: str) -> None:
         """Prints a line."""
-        print(text, flush=True)
+        if not self._is_quiet:
+            print(text, flush=True)
 
     def on_generation(self, info: FinishedGeneration) -> None:
         """Prints the numbers of a generation; steps per second are the session's so far."""

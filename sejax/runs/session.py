@@ -19,8 +19,9 @@ from sejax.ops.files import write_text
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
+from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
-from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.runs.trackers import FinishedGeneration, GuardedTracker, TrackedRun
 from sejax.runs.workers import Chunks
 from sejax.scoring import GenerationInfo
 
@@ -29,7 +30,10 @@ PACKAGES = ("flax", "optax", "evosax", "gymnax", "numpy")
 
 
 def run(
-    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
+    config: LearnConfig,
+    directory: RunDirectory,
+    chunks: Chunks,
+    report: RunProgress | None = None,
 ) -> dict[str, Any]:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
@@ -37,7 +41,7 @@ def run(
       config: the configuration.
       directory: its folder.
       chunks: the generations of this configuration.
-      report: hears how it goes on.
+      report: hears how it goes on; None: nobody does.
 
     Returns:
       What `run.json` holds. `ended` is finished, solved, or diverged: a run of whose agents none
@@ -47,7 +51,7 @@ def run(
       ConfigError: if the folder's state is that of another version.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    report, bilevel = report or Reporter(), chunks.bilevel
+    report, bilevel = report or RunProgress(config, is_quiet=True), chunks.bilevel
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
@@ -94,7 +98,7 @@ def run(
     return summary
 
 
-def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: Reporter) -> LearnState:
+def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:
     """A new state or that of the folder, beside which the proxies are written again."""
     state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
@@ -123,7 +127,7 @@ def _ended(
 
 
 def _advance(
-    chunks: Chunks, state: LearnState, length: int, report: Reporter
+    chunks: Chunks, state: LearnState, length: int, report: RunProgress
 ) -> tuple[LearnState, GenerationInfo]:
     """Runs `length` generations, and returns when they are computed."""
     if length not in chunks.compiled:

@@ -56,19 +56,6 @@ class FinishedGeneration:
     train_steps: int
 
 
-class Reporter:
-    """Hears how a run goes on; this one tells nobody. See `sejax.runs.progress`."""
-
-    def status(self, text: str) -> None:
-        """Hears what is being done now."""
-
-    def say(self, text: str) -> None:
-        """Hears a message that is worth keeping."""
-
-    def on_generation(self, info: FinishedGeneration) -> None:
-        """Hears of a generation after it was saved. What this raises ends the session."""
-
-
 @runtime_checkable
 class Tracker(Protocol):
     """The methods of a tracker, which its configuration makes by `make(run: TrackedRun)`."""
