@@ -87,7 +87,8 @@ def of_cpu(args: argparse.Namespace) -> list[dict[str, Any]]:
     """The figures of this machine's CPU, as sejax computes where there is no other device."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cpu.json"
-        command = [sys.executable, __file__, "--json", path, "--minutes", str(args.minutes / 3)]
+        minutes = str(args.minutes / 3)
+        command = [sys.executable, __file__, "--json", str(path), "--minutes", minutes]
         on_cpu = os.environ | {"JAX_PLATFORMS": "cpu"}
         subprocess.run(command, env=on_cpu, stdout=subprocess.DEVNULL, check=True)
         rows: list[dict[str, Any]] = json.loads(path.read_text())["figures"]

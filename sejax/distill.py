@@ -155,9 +155,7 @@ def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       ConfigError: for a folder of another command, or a policy that cannot be.
       OSError: if a file cannot be written.
     """
-    settings = configuration.plain(config)
-    settings = {k: v for k, v in settings.items() if k not in ("run_dir", "devices")}
-    with Store(folder, to_plain(job) | settings) as store:
+    with Store(folder, settings_of(job, config)) as store:
         store.get(CHECKPOINT)  # which refuses a folder of another command
         return _distilled(job, config, store, words)
 
@@ -202,6 +200,12 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
+
+
+def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+    """What the numbers depend on, as plain values."""
+    plain = configuration.plain(config)
+    return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
