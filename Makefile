@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-suites test-examples test-trackers test-ray test-lowest test-latest lint typecheck \
+.PHONY: run test test-slow test-suites test-examples test-ray test-lowest test-latest lint typecheck \
     claims docs linkcheck dist clean
 
 run: $(VENV)/.installed
@@ -21,7 +21,7 @@ test-slow: $(VENV)/.installed-dev
 
 # --- with packages that the suite leaves out, each in an environment of its own in build/ -----------
 
-test-suites test-examples test-trackers test-ray test-lowest test-latest:
+test-suites test-examples test-ray test-lowest test-latest:
 	$(PYTHON) -m venv --clear build/$@
 	build/$@/bin/python -m pip install --quiet $(PACKAGES) pytest pytest-xdist chex hypothesis
 	build/$@/bin/python -m pytest $(OPTIONS) -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
@@ -33,11 +33,7 @@ test-suites: TESTS := other_suites
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
-test-examples: TESTS := examples gym_sb3 torch_reference torch_nes
-
-# Weights & Biases and TensorBoard's event files.
-test-trackers: PACKAGES := --constraint constraints.txt --editable '.[tensorboard,wandb]'
-test-trackers: TESTS := trackers
+test-examples: TESTS := examples gym_sb3 torch_reference
 
 # A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.
 test-ray: PACKAGES := --constraint constraints.txt --editable '.[ray,search]'

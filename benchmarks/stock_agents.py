@@ -8,7 +8,7 @@ An agent trains once, for the largest number of steps asked for, and is tested o
 steps it is the agent as the last update left it that had seen at most n. Schedules over a training
 (learning rates, exploration) span that training. With `--real-steps` real agents train on with the
 zoo's own schedules, to see after how many steps they are as good as those that the SE taught. Tests
-of real agents are kept in `--real`, and none is made again.
+are kept in `--rows`, and none is made again.
 
 It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
 
@@ -180,23 +180,21 @@ def main() -> None:
         raise SystemExit(f"error: --agents must be in capitals for {args.task}, as RL Zoo's "
                          "settings of it are not here.")  # fmt: skip
     # A look leaves the results that are kept alone.
-    folder = Path("runs/stock_agents" if args.quick else "results/stock_agents")
-    env_id, _ = TASKS[args.task]
-    agents = args.agents or [agent for agent, of in ZOO if of == env_id]
-    path = args.csv or folder / f"{args.task}-{Path(args.source).stem}.csv"
-    real_path = args.real or folder / f"{args.task}-real.csv"
-    real = pd.read_csv(real_path) if real_path.exists() else pd.DataFrame(columns=COLUMNS)
-    each = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
-    taught = run_all([in_budget(args, args.source, *one) for one in each], args.jobs)
-    trainings = [] if args.alone else [in_budget(args, REAL, *one) for one in each]
+    path = args.rows or Path("runs" if args.quick else "results", "stock_agents", "rows.csv")
+    agents = args.agents or of_zoo
+    known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    learners = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
+    worlds = [args.source] if args.alone else [args.source, REAL]
+    trainings = [in_budget(args, world, *x) for world in worlds for x in learners]
     if args.real_steps:
-        trainings += [as_the_zoo(args, *one) for one in each]
-    new = run_all([training for training in trainings if not is_known(real, training)], args.jobs)
-    real = pd.concat([real, new] if len(real) else [new]).drop_duplicates(COLUMNS[:7], keep="last")
-    tables = [(taught, path)] if args.alone else [(taught, path), (real, real_path)]
-    for table, file in tables:
-        write_text(file, table.sort_values(COLUMNS[:7]).to_csv(index=False))
-    rows = list(summarise(args, agents, taught, real))
+        trainings += [as_the_zoo(args, *x) for x in learners]
+    new = run_all([training for training in trainings if not is_known(known, training)], args.jobs)
+    table = pd.concat([known, new] if len(known) else [new])
+    table = table.drop_duplicates(COLUMNS[:7], keep="last").sort_values(COLUMNS[:7])
+    write_text(path, table.to_csv(index=False))
+    table = table[table["task"] == args.task]
+    of_worlds = (table[table["world"] == world] for world in (args.source, REAL))
+    rows = list(summarise(args, agents, *of_worlds))
     common.print_table(
         f"{args.task}: greedy returns on the real task", list(rows[0]),
         [[str(x) for x in row.values()] for row in rows],
@@ -218,8 +216,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alone", action="store_true", help="no agents on the real task")
     parser.add_argument("--real-every", type=int, default=1000, help="steps between their tests")
     parser.add_argument("--jobs", type=int, default=1, help="processes, of one thread each")
-    parser.add_argument("--csv", type=Path, help="results/stock_agents/TASK-SOURCE.csv")
-    parser.add_argument("--real", type=Path, help="results/stock_agents/TASK-real.csv")
+    parser.add_argument("--rows", type=Path, help="results/stock_agents/rows.csv")
 
 
 def agents_of(text: str) -> list[str]:

@@ -126,8 +126,8 @@ def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> di
         "preset": name,
         "generations run": len(curves[0]),
         "first passage": f"{len(reached)} of {len(curves)}",
-        "best incumbent": f"{best:.1f}",
-        "last five incumbents": f"{last.mean():.1f}",
+        "best search mean": f"{best:.1f}",
+        "last five search means": f"{last.mean():.1f}",
         "CPU seconds of a generation": f"{cpu_s:.0f}",
     }
     table = pd.DataFrame(reached)
@@ -160,7 +160,7 @@ def draw(tables: dict[str, list[pd.DataFrame]], solved_reward: float, path: Path
             axis.axhline(solved_reward, color="#3c8d40", ls="--", lw=1.2)
             axis.set_title(f"preset={name}, {len(seeds)} seeds", fontsize=10)
             axis.set_xlabel("NES generation")
-        axes[0][0].set_ylabel("incumbent: mean return\non the real task")
+        axes[0][0].set_ylabel("search mean: return\non the real task")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=150)
 

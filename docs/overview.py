@@ -50,11 +50,10 @@ def draw_loops(axes: Axes) -> None:
 
 def draw_agents(axes: Axes) -> None:
     """Returns on Acrobot by training steps, trained on the SE and on the task."""
-    folder = ROOT / "results/stock_agents"
-    on_se = pd.concat(pd.read_csv(folder / f"acrobot-acrobot{end}.csv") for end in ("", "-20000"))
-    on_se = on_se[on_se["steps"] != 5000]  # between 2,500 and 6,000 of the other trainings
-    on_task = pd.read_csv(folder / "acrobot-real.csv")
-    on_task = on_task[(on_task["total_steps"] > 20_000) & (on_task["steps"] <= 20_000)]
+    rows = pd.read_csv(ROOT / "results/stock_agents/rows.csv").query("task == 'acrobot'")
+    # 5,000 steps are between 2,500 and 6,000 of the other trainings.
+    on_se = rows.query("world != 'the real task' and steps != 5000")
+    on_task = rows.query("world == 'the real task' and total_steps > 20_000 and steps <= 20_000")
     for rows, color, place in ((on_se, BLUE, "the SE"), (on_task, GREY, "the task")):
         for agent, line in STYLES.items():
             means = rows[rows["agent"] == agent].groupby("steps")["mean_return"].mean()

@@ -95,7 +95,7 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
         for run in runs.configs_of(config, settings.runs, folder):
             own = {"kind": kind, "seed": run.seed}
             curves.append(runs.learn([run], chunks=chunks)[list(CURVE)].assign(**own))
-            tests.append(test(settings, kind, run, chunks.learner.proxy, students).assign(**own))
+            tests.append(test(settings, kind, run, chunks.bilevel.proxy, students).assign(**own))
     return stack({"curves": pd.concat(curves), "agents": pd.concat(tests)})
 
 

@@ -94,7 +94,7 @@ def time_generations(settings: Timings, row: str, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
     chunks = workers.make_chunks(config_of(settings, row, preset))
     chunks.compile(1)
-    program = chunks.learner
+    program = chunks.bilevel
     state = chunks.init(jax.random.key(settings.seed))
     idle = jax.tree.map(lambda x: x.copy(), dataclasses.replace(state, solved=~state.solved))
     jax.block_until_ready(chunks.advance(idle, 1))  # with nothing to do

@@ -3,7 +3,7 @@
     for each generation:
       ask       the strategy for a population around the incumbent proxy
       evaluate  train one fresh agent on each candidate, test it on the real task
-      tell      the strategy the scores, which moves the incumbent
+      tell      the strategy the scores, which moves the incumbent (the search mean)
 
 Source: paper, Algorithm 1.
 """
@@ -26,7 +26,7 @@ from sejax.es.nes import NESConfig
 from sejax.generation import Candidates, GenerationEvaluator
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
-from sejax.ops.scores import or_lowest
+from sejax.ops.scores import or_minus_inf
 from sejax.options import counts, require
 from sejax.options.registry import Makes, RunConfig, make, require_part
 from sejax.proxies.base import ProxyEnv
@@ -140,7 +140,7 @@ class Bilevel:
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
         scores = self.scoring.judged(outcome)
-        score, by_agent = or_lowest(scores.incumbent_mean), or_lowest(scores.agent_means)
+        score, by_agent = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(
             state,

@@ -5,10 +5,11 @@ Without agent=NAME they are those that the proxy was learned with.
   python -m sejax.evaluate proxy=RUN_DIR num_agents=20
   python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
 
-Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
+Writes evaluation.csv and .json into out_dir. --print-config prints the configuration alone.
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import time
@@ -24,11 +25,11 @@ from rich.table import Table
 from sejax import agents, envs
 from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
-from sejax.ops.files import as_file_name, require_writable, write_text
+from sejax.ops.files import require_writable, write_text
 from sejax.options import registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
-from sejax.runs import commands, compose, plots, runtime
+from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
 from sejax.training import TrainingConfig
@@ -88,7 +89,7 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
 
 
 def evaluate(config: EvaluateConfig) -> float:
-    """Trains `num_agents` agents in each world, prints a table and writes CSV, JSON and PNG.
+    """Trains `num_agents` agents in each world, prints a table and writes CSV and JSON.
 
     Returns:
       The mean test return of the agents trained on the proxy (on the real task for `proxy=real`).
@@ -100,18 +101,12 @@ def evaluate(config: EvaluateConfig) -> float:
     setup = setup_of(config)
     out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
-    tables = {
-        (world, key): _train_and_test(config, setup, world, key)
-        for world in setup.worlds
-        for key in config.agents
-    }
-    table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
+    pairs = itertools.product(setup.worlds, config.agents)
+    table = pd.concat([_train_and_test(config, setup, *pair) for pair in pairs])
     summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
     _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    title = f"fresh {' + '.join(config.agents)} agents on {setup.task.name}"
-    plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png", title)
     first = table[table["world"] == next(iter(setup.worlds))]
     return float(first["test_return"].mean())
 
@@ -216,7 +211,8 @@ def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) 
         numbers = {"agent": key, "number": range(config.num_agents)}
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
-    return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **varied})
+    numbers |= {"test_return": outcome.test_return, **of_agents, **varied, "world": world}
+    return pd.DataFrame(numbers)
 
 
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -262,8 +258,7 @@ def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) ->
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    files = f"{setup.out_dir}/evaluation.csv, .json and .png"
-    console.print(f"{files} hold every agent.", soft_wrap=True)
+    console.print(f"{setup.out_dir}/evaluation.csv holds every agent.", soft_wrap=True)
 
 
 if __name__ == "__main__":

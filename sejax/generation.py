@@ -95,7 +95,7 @@ class GenerationEvaluator:
 
         self.runs = [run_with(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.sizes = [scoring.trainings_of(agent).size for agent in range(len(agents))]
+        self.sizes = [scoring.trainings_of(i).size for i in range(len(agents))]
         self._scoring = scoring
         self._spread = spread_groups_over_devices(self.runs, devices, num_parallel, self.widths)
 
@@ -108,12 +108,14 @@ class GenerationEvaluator:
         by_agent = []
         num_evals = self._scoring.evaluations.num_evals
         pairs = zip(self._scoring.candidates, self.sizes, strict=True)
-        for agent, (numbers, size) in enumerate(pairs):
+        for agent_index, (numbers, size) in enumerate(pairs):
             population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
             incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
             active, test_params = jax.tree.map(lambda x, size=size: jnp.repeat(x, size), shared)
             trainings = Trainings(
-                key=jnp.concatenate([keys.population[numbers].ravel(), keys.incumbent[:, agent]]),
+                key=jnp.concatenate(
+                    [keys.population[numbers].ravel(), keys.incumbent[:, agent_index]]
+                ),
                 candidate=jnp.concatenate([population, incumbent]),
                 active=active,
                 test_params=test_params,
@@ -128,6 +130,6 @@ class GenerationEvaluator:
         """
         if len(by_agent) == 1:
             return by_agent[0]
-        numbers = [self._scoring.trainings_of(agent) for agent in range(len(by_agent))]
+        numbers = [self._scoring.trainings_of(i) for i in range(len(by_agent))]
         order = np.argsort(np.concatenate(numbers))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

@@ -161,9 +161,9 @@ class RewardThreshold(ObjectiveConfig):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        got = "got reward_threshold. Set env.solved_reward, or objective=max_reward"
-        must = f"must need no threshold where the task has none; {got}."
-        require(task.is_solvable, "objective", must)
+        must = f"must be another one, as {task.name} has no solved reward; got reward_threshold."
+        fix = "Set env.solved_reward=N, or objective=max_reward."
+        require(task.is_solvable, "objective", f"{must} {fix}")
 
         def score(outcome: Outcome) -> Array:
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)

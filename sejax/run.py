@@ -78,7 +78,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     with contextlib.ExitStack() as exit_stack:
         compiled = None
         for config in configs:
-            with RunDirectory(config) as directory, RunProgress(config) as progress:
+            with RunDirectory(config) as directory:
+                progress = RunProgress(config)
                 try:
                     program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:
@@ -88,15 +89,14 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         compiled = program
                     summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
-                    progress.stop()
-                    saved = f"{directory.finished_generations} generations are saved"
+                    saved = f"{len(directory.rows)} generations are saved"
                     message = f"Interrupted. {saved} in {directory.path}; the same command resumes"
                     commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if summary["ended"] == "diverged":
                     diverged.append(directory.path)
                 elif len(configs) == 1:
-                    progress.finish(directory, chunks.learner, scores[-1])
+                    progress.finish(directory, chunks.bilevel, scores[-1])
     if len(configs) > 1:
         print("Best scores of the search mean:")
         for config, score in zip(configs, scores, strict=True):

@@ -109,9 +109,9 @@ class Scoring:
             evaluations=dataclasses.replace(strategy.evaluations, num_incumbent_evals=num_evals),
         )
 
-    def trainings_of(self, agent: int) -> np.ndarray:
+    def trainings_of(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all of a generation."""
-        of_population, of_incumbent = self._numbers(agent)
+        of_population, of_incumbent = self._numbers(agent_index)
         return np.concatenate([of_population, self._num_population + of_incumbent])
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
@@ -159,8 +159,8 @@ class Scoring:
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
         population, incumbent = jnp.split(scores, [self._num_population])
         means = []
-        for agent in range(self.mixture.size):
-            of_population, of_incumbent = self._numbers(agent)
+        for agent_index in range(self.mixture.size):
+            of_population, of_incumbent = self._numbers(agent_index)
             repaired, mean = self.evaluations.incumbent_scores(
                 incumbent[of_incumbent], population[of_population]
             )
@@ -181,11 +181,11 @@ class Scoring:
         """Trainings on the population."""
         return sum(numbers.size for numbers in self.candidates) * self.evaluations.num_evals
 
-    def _numbers(self, agent: int) -> Groups[np.ndarray]:
+    def _numbers(self, agent_index: int) -> Groups[np.ndarray]:
         """The numbers of an agent's trainings within each group."""
         num_evals, num_agents = self.evaluations.num_evals, self.mixture.size
-        of_population = np.add.outer(self.candidates[agent] * num_evals, np.arange(num_evals))
-        of_incumbent = np.arange(agent, self.evaluations.num_incumbent_evals, num_agents)
+        of_population = np.add.outer(self.candidates[agent_index] * num_evals, np.arange(num_evals))
+        of_incumbent = np.arange(agent_index, self.evaluations.num_incumbent_evals, num_agents)
         return Groups(of_population.ravel(), of_incumbent)
 
     def _by_agent(

@@ -46,9 +46,9 @@ def main(overrides: Sequence[str]) -> None:
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
-    from sejax.searching.config import SearchConfig
+    from sejax.searching.config import StudyConfig
 
-    lines = field_lines(to_plain(SearchConfig()), [("", SearchConfig)], {})
+    lines = field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})
     return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 

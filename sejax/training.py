@@ -22,11 +22,11 @@ from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
+from sejax.ops.modes import require_modes
 from sejax.ops.parallel import in_batches_on_cpu
 from sejax.options import (
     LARGEST,
     Options,
-    as_text,
     counts,
     not_negative,
     one_of,
@@ -38,19 +38,6 @@ from sejax.options.registry import require_part
 from sejax.proxies.base import ProxyEnv, is_real
 
 STOP_RULES = ("plateau", "solved", "never")
-
-
-# Modes of jax in which programs of sejax fail: values that they may have, and why no others.
-MODES: dict[str, tuple[tuple[object, ...], str]] = {
-    "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
-    "jax_debug_nans": ((False,), "what has not happened is nan, and a training may diverge"),
-    "jax_debug_infs": ((False,), "the score before the first is minus infinity"),
-    "jax_disable_jit": ((False,), "trainings are compiled as a whole"),
-    "jax_debug_key_reuse": ((False,), "the state of a run that has ended keeps its key"),
-    "jax_numpy_rank_promotion": (("allow", "warn"), "operands are broadcast"),
-    "jax_numpy_dtype_promotion": (("standard",), "numbers of several types are combined"),
-    "jax_transfer_guard": (("allow", None, "log"), "numbers of Python are moved to devices"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,18 +87,6 @@ class TrainingConfig(Options):
     def num_tests_between(self) -> int:
         """Test episodes after each training episode."""
         return max(self.tests_between, int(self.stops_by_tests))
-
-
-def require_modes() -> None:
-    """Checks that jax is in no mode in which programs of sejax fail.
-
-    Raises:
-      ConfigError: of the mode, such as `jax_enable_x64`.
-    """
-    for mode, (allowed, reason) in MODES.items():
-        got = getattr(jax.config, mode)
-        off = f"Set {mode.upper()}={as_text(allowed[0])}."
-        require(got in allowed, mode, f"must be {as_text(allowed[0])}: {reason}; got {got}. {off}")
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:

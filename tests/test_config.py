@@ -284,7 +284,7 @@ def test_help_shows_each_field_with_its_value_and_text(module, words, schema, ex
         assert text in said
 
 
-@pytest.mark.parametrize("override", ["tracker=wandb", "tracker=tensorboard", "machines=ray"])
+@pytest.mark.parametrize("override", ["tracker=tensorboard", "machines=ray"])
 def test_a_package_that_is_missing_is_named_before_anything_starts(override, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert f"pip install 'sejax[{override.partition('=')[2]}]'" in str(refused(override))

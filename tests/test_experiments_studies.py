@@ -1,4 +1,4 @@
-"""The experiments on score transforms and on histograms of SEs."""
+"""What experiments have in common: intervals; and the search of score transforms."""
 
 from types import SimpleNamespace
 
@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import sejax
 from experiments import score_transforms
+from experiments.common.statistics import difference_interval, mean_interval, worst_tenth
 from sejax.bilevel import make_bilevel
 
 # --- score transforms -----------------------------------------------------------------------------
@@ -47,3 +49,32 @@ def test_the_search_is_the_bilevel_loop(monkeypatch):
         assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
+
+
+# --- intervals, against scipy ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [5, 6, 10, 33])
+def test_intervals_are_those_of_scipys_t_tests(size):
+    values = np.random.default_rng(size).exponential(size=size)
+    expected = scipy.stats.ttest_1samp(values, 0).confidence_interval()
+    assert mean_interval(values) == pytest.approx(tuple(expected))
+    others = np.random.default_rng(0).normal(size=7)
+    welch = scipy.stats.ttest_ind(values, others, equal_var=False).confidence_interval()
+    assert difference_interval(values, others) == pytest.approx(tuple(welch))
+
+
+def test_fewer_than_five_values_have_no_interval():
+    four = [1.0, 2.0, 3.0, 4.0]
+    assert np.isnan([mean_interval(four), difference_interval(four, [1.0] * 9)]).all()
+
+
+def test_the_worst_tenth_is_the_mean_of_the_lowest_values():
+    assert worst_tenth(np.random.default_rng(0).permutation(20)) == 0.5
+    assert worst_tenth([3.0, 1.0, 2.0]) == 1.0 and worst_tenth(range(11)) == 0.5
+    assert np.isnan(worst_tenth([np.nan, 1.0]))
+
+
+def test_equal_runs_have_no_uncertainty():
+    assert mean_interval([3.0] * 5) == (3.0, 3.0)
+    assert difference_interval([3.0] * 5, [1.0] * 6) == (2.0, 2.0)

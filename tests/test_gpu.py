@@ -20,5 +20,4 @@ def test_the_command_measures_and_writes_its_result(tmp_path):
     }  # fmt: skip
     (row,) = result["figures"]
     assert row["agents"] == 16 and row["steps"] == 16 * 64 and row["steps_per_s"] > 0
-    assert 10 < result["kernels"]["quick DDQN"]["a_step"] < 100
-    assert "Kernels of an agent step" in said
+    assert "quick DDQN trains" in said

@@ -16,7 +16,7 @@ from support import paper_se, printed, random_like, refused, shapes_of
 
 import sejax.gym
 from sejax import envs
-from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
+from sejax.gym import RealTask, SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
@@ -64,7 +64,7 @@ def world_of(task="cartpole", max_steps=4, outputs=None, **config):
 
 def env_of(world, num_envs=None):
     """One environment of an SE, or several side by side."""
-    return SyntheticVectorEnv(world, num_envs) if num_envs else SyntheticEnv(world)
+    return SyntheticVectorEnv(world, num_envs) if num_envs else SyntheticGymEnv(world)
 
 
 def an_env(stored, source):
@@ -184,7 +184,7 @@ def assert_same(got, expected, tolerance=1e-5):
 def test_lanes_are_single_environments(name, mode):
     world, num_envs = world_of(**SES[name]), 3
     lanes = SyntheticVectorEnv(world, num_envs, mode)
-    singles = SyncVectorEnv([lambda: SyntheticEnv(world)] * num_envs, autoreset_mode=mode)
+    singles = SyncVectorEnv([lambda: SyntheticGymEnv(world)] * num_envs, autoreset_mode=mode)
     assert lanes.metadata == singles.metadata | {"autoreset_mode": AutoresetMode(mode)}
     assert lanes.observation_space == singles.observation_space
     assert lanes.action_space == singles.action_space

@@ -14,7 +14,7 @@ from gymnasium.wrappers import TransformObservation
 from test_gym import SES, assert_same, world_of
 
 import sejax.gym
-from sejax.gym import SyntheticEnv
+from sejax.gym import SyntheticGymEnv
 from sejax.proxies import header
 
 pytest.importorskip("stable_baselines3", reason="needs the extra sb3: make test-examples")
@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 def test_lanes_are_single_environments(name):
     world, num_envs = world_of(**SES[name]), 3
     lanes = SyntheticVecEnv(world, num_envs)
-    singles = DummyVecEnv([lambda: SyntheticEnv(world)] * num_envs)
+    singles = DummyVecEnv([lambda: SyntheticGymEnv(world)] * num_envs)
     lanes.action_space.seed(0)
     assert lanes.seed(5) == singles.seed(5) == [5, 6, 7]
     assert_same(lanes.reset(), singles.reset())

@@ -22,7 +22,6 @@ from sejax.runs import commands, run_directory, runtime, session, workers
 from sejax.runs import config as configuration
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
-from sejax.runs.trackers import Reporter
 
 OWN = [*ROOM, "seed=12"]
 TINY = [*OWN, "agent.learning_rate=0.5"]
@@ -38,11 +37,12 @@ def chunks(*words):
     return workers.make_chunks(sejax.config([*TINY, *words]))
 
 
-class Report(Reporter):
+class Report(RunProgress):
     """Keeps the messages."""
 
-    def __init__(self):
+    def __init__(self, config):
         self.said = []
+        super().__init__(config)
 
     def say(self, text):
         self.said.append(text)
@@ -51,7 +51,7 @@ class Report(Reporter):
 def learn(path, *words, program=()):
     """A session of a run, as `sejax.run` has it; returns its messages."""
     config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
-    report = Report()
+    report = Report(config)
     with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, chunks(*program), report)
     return "\n".join(report.said)
@@ -108,7 +108,7 @@ def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, monkey
         context.setattr(runtime, "versions", lambda: {"jax": "0.1"})
         learn(tmp_path, "generations=4")
     said = learn(tmp_path, "generations=6")
-    assert "Going on at generation 4" in said and "made with {'jax': '0.1'}" in said
+    assert "Resuming at generation 4" in said and "made with {'jax': '0.1'}" in said
     assert_same(tmp_path, uninterrupted)
     both, whole = (
         json.loads((path / "run.json").read_text()) for path in (tmp_path, uninterrupted)
@@ -202,7 +202,8 @@ def family_chunks():
 def learn_families(path, *words):
     """A session of a run with two families; returns the line that is printed of its last chunk."""
     config = sejax.config([*OWN, *words, f"run_dir={path}"])
-    with run_directory.RunDirectory(config) as directory, RunProgress(config) as report:
+    report = RunProgress(config)
+    with run_directory.RunDirectory(config) as directory:
         session.run(config, directory, family_chunks(), report)
 
 
@@ -234,10 +235,10 @@ def test_metrics_and_proxies_tell_of_each_family(two_families):
 def test_a_run_of_families_goes_on_whichever_way_they_are_named(two_families, tmp_path, capsys):
     learn_families(tmp_path, *FAMILIES, "generations=2")
     assert re.search(
-        r"incumbent \S+ ± \S+ \(q_learning \S+, sarsa \S+\), best", capsys.readouterr().out
+        r"search mean \S+ ± \S+ \(q_learning \S+, sarsa \S+\), best", capsys.readouterr().out
     )
     learn_families(tmp_path, "agents=[q_learning,sarsa]", "generations=5")
-    assert "Going on at generation 2" in capsys.readouterr().out
+    assert "Resuming at generation 2" in capsys.readouterr().out
     assert_same(tmp_path, two_families)
     assert is_drawn(tmp_path / "learning_curve.png")
 
@@ -293,7 +294,7 @@ def test_a_killed_run_goes_on_to_the_same_numbers(uninterrupted, tmp_path):
     ended = process(sys.executable, "-c", DRIVER, "SIGKILL", *words)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     assert len(rows(tmp_path)) == 2
-    assert "Going on at generation 2" in learn(tmp_path, "generations=6")
+    assert "Resuming at generation 2" in learn(tmp_path, "generations=6")
     assert_same(tmp_path, uninterrupted)
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
@@ -305,7 +306,7 @@ def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
     assert ended.returncode == 128 + number, ended.stderr
     (count,) = re.findall(r"(\d+) generations are saved in .* resumes from there", ended.stdout)
     assert int(count) == len(rows(tmp_path)) >= 2 and (tmp_path / "proxy.safetensors").exists()
-    assert f"Going on at generation {count}" in learn(tmp_path, f"generations={int(count) + 1}")
+    assert f"Resuming at generation {count}" in learn(tmp_path, f"generations={int(count) + 1}")
 
 
 def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, capsys):
@@ -314,7 +315,7 @@ def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, caps
     assert "compiling ...\n" in said
     counted = [x.split("/")[0] for x in said.splitlines() if x.startswith("generation ")]
     assert counted == [f"generation {row['generation']}" for row in rows(tmp_path)]
-    assert "generation 2/2: incumbent" in said  # the last one
+    assert "generation 2/2: search mean" in said  # the last one
 
 
 def test_stop_when_solved_may_change_between_sessions(uninterrupted, tmp_path):
@@ -352,7 +353,7 @@ def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     assert best == pytest.approx(max(scores))
-    assert f"best incumbent mean {best:.1f}, solved at 0.8" in said
+    assert f"best search mean {best:.1f}, solved at 0.8" in said
     assert f"python -m sejax.evaluate proxy={uninterrupted} num_agents=20" in said
     assert "\ngridworld_2x2: " + ("solved" if best >= 0.8 else "learned") in f"\n{said}"
 

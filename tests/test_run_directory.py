@@ -47,7 +47,7 @@ def open_run(path: Path, **changes) -> RunDirectory:
 def go(path: Path, generations: int, block: int = 1, **changes) -> int:
     """A session of a run; returns the generation that it went on from."""
     with open_run(path, generations=generations, **changes) as directory:
-        start = directory.finished_generations
+        start = len(directory.rows)
         state = directory.restore(state_after(0))
         if state is None:
             assert start == 0

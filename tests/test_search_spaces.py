@@ -128,7 +128,7 @@ def test_a_file_of_ranges_must_map_fields_to_ranges(tmp_path, monkeypatch, text)
 
 def test_help_says_what_each_field_is():
     said = command.help_text([])
-    assert all(f"  {name}=" in said for name in to_plain(search_config.SearchConfig()))
+    assert all(f"  {name}=" in said for name in to_plain(search_config.StudyConfig()))
 
 
 def test_without_optuna_the_extra_is_named(monkeypatch):

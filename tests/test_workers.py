@@ -24,7 +24,7 @@ def require_equal_numbers(words, generations):
         return [workers.score(setup, share) for share in reversed(shares)][::-1]
 
     remote = RemoteChunks(config, compute)
-    local = Chunks(remote.learner)
+    local = Chunks(remote.bilevel)
     local.compile(1)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))
     for _ in range(generations):
@@ -65,6 +65,15 @@ def test_so_they_do_with_the_flags_of_a_command(case):
     environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
     folder = Path(__file__).parent
     printed(sys.executable, "-c", program, *CASES[case], env=environment, cwd=folder)
+
+
+def make_room():
+    return sejax.envs.make("gridworld_2x2")
+
+
+def test_a_worker_imports_the_plugins_that_were_typed():
+    setup = workers.setup_of(sejax.config(["env=test_workers:make_room", *SOLVING[1:]]))
+    assert len(workers._programs(setup)) == 1
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):

@@ -24,7 +24,7 @@ class MixtureConfig(Options):
     """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line.
 
     Attributes:
-      aggregate: The incumbent's score, given its mean with each agent: the mean of those, or the
+      aggregate: The search mean's score, given that with each agent: the mean of those, or the
         worst.
     """
 

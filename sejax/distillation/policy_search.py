@@ -29,7 +29,7 @@ from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
 from sejax.evaluation import Steps, Tests, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
-from sejax.ops.scores import or_worst
+from sejax.ops.scores import or_lowest_finite
 from sejax.options import Options, counts, finite, not_negative, option, positive, require
 from sejax.proxies.exact import Layer, require_vectors
 from sejax.runs.store import Store
@@ -188,7 +188,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
             size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
         sizes = jnp.broadcast_to(size, num_episodes)
         returns, num_steps = spread(keys, tried._replace(weights=weights), sizes)
-        plus, minus = jnp.split(or_worst(returns - config.alive_bonus * num_steps), 2)
+        plus, minus = jnp.split(or_lowest_finite(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
         slope = jnp.tensordot((plus - minus)[top], directions[top], 1)

@@ -8,8 +8,7 @@ imported when its spaces are asked for.
 
 import copy
 import dataclasses
-import functools
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,6 @@ from jaxtyping import Array, Bool
 
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
 from sejax.options import ConfigError, shortened
-
-if TYPE_CHECKING:
-    from gymnax.environments.spaces import Space as GymnaxSpace
 
 
 @struct.dataclass
@@ -102,12 +98,10 @@ class Environment(Generic[State, Params]):
         info = {"discount": jax.lax.select(terminated, 0.0, 1.0)}
         return self.observe(state), state, reward, terminated, info
 
-    @functools.partial(jax.jit, static_argnames=("self",))
     def reset(self, key: Array, params: Params | None = None) -> tuple[Array, State]:
         """As `reset_env`; for loops that are not sejax's."""
-        return self.reset_env(key, self.default_params if params is None else params)
+        return _gymnax_class().reset(self, key, params)
 
-    @functools.partial(jax.jit, static_argnames=("self",))
     def step(
         self, key: Array, state: State, action: Array, params: Params | None = None
     ) -> tuple[Array, State, Array, Array, Array, dict[str, Array]]:
@@ -117,23 +111,13 @@ class Environment(Generic[State, Params]):
           `(obs, state, reward, terminated, truncated, info)`, whose `info` has the
           `final_observation` of the step.
         """
-        params = self.default_params if params is None else params
-        key_step, key_reset = jax.random.split(key)
-        next_obs, state, reward, terminated, info = self.step_env(key_step, state, action, params)
-        truncated = self.is_truncated(state, params)
-        obs, state = jax.tree.map(
-            functools.partial(jax.lax.select, terminated | truncated),
-            self.reset_env(key_reset, params),
-            (next_obs, state),
-        )
-        ends = {"terminated": terminated, "truncated": truncated, "final_observation": next_obs}
-        return obs, state, reward, terminated, truncated, {**info, **ends}
+        return _gymnax_class().step(self, key, state, action, params)
 
-    def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def observation_space(self, params: Params | None = None) -> Any:
         """gymnax's `Box` or `Discrete`."""
         return _as_gymnax(spaces_of(self)[0])
 
-    def action_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def action_space(self, params: Params | None = None) -> Any:
         """gymnax's `Box` or `Discrete`."""
         return _as_gymnax(spaces_of(self)[1])
 
@@ -171,6 +155,10 @@ def with_one_done(env: Any) -> Any:
 
     vars(old)["step"] = step
     return old
+def _gymnax_class() -> Any:
+    from gymnax.environments.environment import Environment as GymnaxEnvironment
+
+    return GymnaxEnvironment
 
 
 def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space, Space]:
@@ -187,7 +175,7 @@ def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space,
         return _of_gymnax(spaces[0], "observations"), _of_gymnax(spaces[1], "actions")
 
 
-def _as_gymnax(space: Space) -> "GymnaxSpace":
+def _as_gymnax(space: Space) -> Any:
     from gymnax.environments import spaces
 
     if isinstance(space, Discrete):
@@ -196,7 +184,7 @@ def _as_gymnax(space: Space) -> "GymnaxSpace":
     return spaces.Box(low, high, low.shape, jnp.float32)
 
 
-def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
+def _of_gymnax(space: Any, what: str) -> Space:
     from gymnax.environments import spaces
 
     if isinstance(space, spaces.Discrete):

@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,6 @@ from jaxtyping import Array, Float
 from sejax.envs.environment import Environment, EnvParams, EnvState, Params, State, Step, spaces_of
 from sejax.envs.spec import Box, Discrete, Space
 from sejax.options import require, shortened
-
-if TYPE_CHECKING:
-    from gymnax.environments.spaces import Space as GymnaxSpace
 
 
 class Wrapper(Environment[State, Params]):
@@ -42,10 +39,10 @@ class Wrapper(Environment[State, Params]):
     def is_truncated(self, state: State, params: Params) -> Array:
         return self.env.is_truncated(state, params)
 
-    def action_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def action_space(self, params: Params | None = None) -> Any:
         return super().action_space() if self.spaces else self.env.action_space(params)
 
-    def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
+    def observation_space(self, params: Params | None = None) -> Any:
         return super().observation_space() if self.spaces else self.env.observation_space(params)
 
 

@@ -47,7 +47,7 @@ class EvosaxConfig(StrategyOptions):
 
     name: str = option("open_es", one_of(ALGORITHMS))
     population_size: int = 32
-    num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
+    num_incumbent_evals: int = option(16, counts("the score of the search mean selects the proxy"))
     noise_std: float = option(0.05, positive("candidates must differ", MAX_SCALE))
     noise_std_decay: float = option(1.0, shrinks())
     step_size: float = option(0.05, positive("the mean would not move", MAX_SCALE))

@@ -13,20 +13,20 @@ from jaxtyping import Array, Float
 
 from sejax.es.base import MAX_SCALE, Strategy, StrategyOptions
 from sejax.es.score_transforms import OwnTransform, require_transform, transform_of
-from sejax.ops.scores import or_lowest
+from sejax.ops.scores import or_minus_inf
 from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 
 @dataclass(frozen=True, kw_only=True)
 class NESConfig(StrategyOptions):
-    """NES with mirrored sampling and evaluation of the incumbent (Algorithm 1).
+    """NES with mirrored sampling and evaluation of the search mean (Algorithm 1).
 
     The defaults are what was measured to work for SEs (docs/defaults.md); `preset=paper` has the
     paper's.
 
     Attributes:
       population_size: n_p: perturbations of a generation
-      num_incumbent_evals: Agents on the incumbent; null: one for each perturbation, as in the
+      num_incumbent_evals: Agents on the search mean; null: one for each perturbation, as in the
         paper.
       noise_std: sigma: std of the weight perturbation
       noise_std_decay: factor on sigma after each generation
@@ -40,7 +40,9 @@ class NESConfig(StrategyOptions):
     """
 
     population_size: int = 64
-    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
+    num_incumbent_evals: int | None = option(
+        16, counts("the score of the search mean selects the proxy")
+    )
     noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE))
     noise_std_decay: float = option(0.97, shrinks())
     step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE))
@@ -125,6 +127,6 @@ def better_signs(
 ) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
     """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
-    use_minus = or_lowest(minus) > or_lowest(plus)
+    use_minus = or_minus_inf(minus) > or_minus_inf(plus)
     sign = jnp.where(use_minus, -1.0, 1.0)
     return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]

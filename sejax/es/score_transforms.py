@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.ops.scores import is_tie, or_lowest, or_worst
+from sejax.ops.scores import is_tie, or_lowest_finite, or_minus_inf
 from sejax.options import ConfigError, registry, require, told, unknown_name
 
 FIELD = "es.score_transform"
@@ -34,7 +34,7 @@ def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     Returns:
       `[pop]` weights; all 0 if all scores are equal.
     """
-    scores = or_worst(scores)
+    scores = or_lowest_finite(scores)
     return _safe_divide(scores - scores.min(), scores.max() - scores.min())
 
 
@@ -43,7 +43,7 @@ def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     :math:`R_i` counts the candidates with a lower score, so that ties share a rank.
     """
-    scores = or_lowest(scores)
+    scores = or_minus_inf(scores)
     ranks = (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
     return _safe_divide(ranks, ranks.max())  # the lowest is 0
 
@@ -68,7 +68,7 @@ def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """1 for the candidate of the best rank (for each, if several share it), 0 for the others."""
-    scores = or_lowest(scores)
+    scores = or_minus_inf(scores)
     return jnp.where((scores == scores.max()) & jnp.isfinite(scores), 1.0, 0.0)
 
 
@@ -139,7 +139,7 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         require(is_fit, FIELD, f"{must}. Mend {choice}, or set {FIELD}=rank.")
 
     def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-        weights = jnp.asarray(function(or_worst(scores)), jnp.float32)
+        weights = jnp.asarray(function(or_lowest_finite(scores)), jnp.float32)
         return jnp.where(jnp.isfinite(weights) & jnp.isfinite(scores).any(), weights, 0.0)
 
     return transform
@@ -150,7 +150,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     Every candidate with a finite score is better than an incumbent without one.
     """
-    finite = or_worst(scores)
+    finite = or_lowest_finite(scores)
     below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
     floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
     is_better = jnp.isfinite(scores) & ~(jnp.isfinite(incumbent) & is_tie(scores, incumbent))
@@ -162,7 +162,7 @@ def _scaled_utilities(scores: Scores, subtracted: float) -> Scores:
 
     They sum to 1 before, and are 0 for a score that is not finite, whatever its rank.
     """
-    ranked = or_lowest(scores)
+    ranked = or_minus_inf(scores)
     best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)
     utilities = jnp.maximum(0.0, jnp.log(scores.shape[0] / 2 + 1) - jnp.log(best_is_one))
     utilities = jnp.where(jnp.isfinite(scores), utilities, 0.0)

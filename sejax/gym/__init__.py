@@ -18,7 +18,7 @@ Example:
 
 from sejax.gym.registration import make, make_sb3, make_vec, register
 from sejax.gym.reward import RewardNetwork
-from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
+from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import GYMNASIUM_IDS, GridWorld, RealTask
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
     "GridWorld",
     "RealTask",
     "RewardNetwork",
-    "SyntheticEnv",
+    "SyntheticGymEnv",
     "SyntheticVectorEnv",
     "SyntheticWorld",
     "make",
@@ -35,4 +35,5 @@ __all__ = [
     "register",
 ]
 
+SyntheticEnv = SyntheticGymEnv  # its older name
 register()

@@ -9,7 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
-from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
+from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
 from sejax.options import ConfigError, as_python, counts, registry
 from sejax.proxies.header import Header, pretrained_names, read
@@ -44,7 +44,7 @@ def make(
     """
     header, world = _read(source, task)
     if world:
-        return SyntheticEnv(world)
+        return SyntheticGymEnv(world)
     options: dict[str, Any] = {"render_mode": render_mode, "disable_env_checker": True}
     real = gymnasium.make(str(task), **options) if task else real_env(header, **options)
     return RewardNetwork(real, source)

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sejax.gym.synthetic import SyntheticEnv, SyntheticVectorEnv, SyntheticWorld
+from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Info
 
 
@@ -25,7 +25,7 @@ class SyntheticVecEnv(DummyVecEnv):
     """
 
     def __init__(self, world: SyntheticWorld, num_envs: int):
-        super().__init__([partial(SyntheticEnv, world)] * num_envs)
+        super().__init__([partial(SyntheticGymEnv, world)] * num_envs)
         self._episodes = SyntheticVectorEnv(world, num_envs)
 
     def reset(self) -> np.ndarray:

@@ -168,7 +168,7 @@ class SyntheticWorld:
         return outputs
 
 
-class SyntheticEnv(gymnasium.Env[Any, Any]):
+class SyntheticGymEnv(gymnasium.Env[Any, Any]):
     """An SE: small networks that make the next state, the reward and the end of an episode.
 
     Observations are float32 vectors without bounds, since a learned world need not stay where the
@@ -223,7 +223,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """Episodes of an SE as a Gymnasium vector environment.
 
-    Environment i equals `SyntheticEnv` after `reset(seed=seed + i)` up to rounding, whatever
+    Environment i equals `SyntheticGymEnv` after `reset(seed=seed + i)` up to rounding, whatever
     happens in the others: each has a generator of its own, which draws its starts and ends. Infos,
     and what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
 

@@ -21,12 +21,12 @@ def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.where(finite, scores, 0.0).sum() / finite.sum()
 
 
-def or_lowest(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def or_minus_inf(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Scores in which what is not finite is minus infinity."""
     return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
 
 
-def or_worst(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def or_lowest_finite(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Scores in which what is not finite is the worst finite one, or 0 if there is none."""
     finite = jnp.isfinite(scores)
     worst = jnp.min(jnp.where(finite, scores, jnp.inf))

@@ -147,7 +147,6 @@ BUILT_IN = {
     "tracker": {
         "none": "sejax.runs.trackers:NoTracker",
         "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
-        "wandb": "sejax.runs.trackers:WandbConfig",
     },
     "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
 }

@@ -299,7 +299,7 @@ def save(
       >>> load_proxy(path).record
       {'score': 195.0}
     """
-    _write(path, env, [weights], [record], config, discount, is_set=False)
+    save_set(path, env, [weights], [record], config, discount, is_set=False)
 
 
 def save_set(
@@ -309,25 +309,16 @@ def save_set(
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None = None,
     discount: float | None = None,
+    is_set: bool = True,
 ) -> None:
     """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
+
+    With `is_set=False` the file holds a single proxy, as `save` writes it.
 
     Raises:
       ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    _write(path, env, weights, records, config, discount, is_set=True)
-
-
-def _write(
-    path: str | Path,
-    env: ProxyEnv,
-    weights: Sequence[PyTree],
-    records: Sequence[Mapping[str, Any]],
-    config: Mapping[str, Any] | None,
-    discount: float | None,
-    is_set: bool,
-) -> None:
     is_known = discount is not None or not env.config.needs_discount
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(is_known, "discount", must)
@@ -420,7 +411,7 @@ def load_proxy(
       proxy: as of `load`.
       option: name of `source` in messages.
     """
-    return _proxies_of(header.read(source, option, single=True), task, proxy, option)[0]
+    return load_set(source, task, proxy, option, single=True)[0]
 
 
 def load_set(
@@ -429,6 +420,7 @@ def load_set(
     proxy: ProxyConfig | None = None,
     option: str = "source",
     kind: str | None = None,
+    single: bool = False,
 ) -> ProxySet:
     """Loads a set of proxies; a single stored one is a set of one.
 
@@ -438,6 +430,7 @@ def load_set(
       proxy: as of `load`.
       option: name of `source` in messages.
       kind: "se" or "rn", which the proxies must be; None for any.
+      single: whether the file must hold one proxy.
 
     Raises:
       ConfigError: as `load`, or if its proxies are of another kind.
@@ -447,13 +440,7 @@ def load_set(
       >>> len(rns), rns[0].params.discount
       (1, 0.8)
     """
-    stored = header.read(source, option, () if kind is None else (kind,))
-    return _proxies_of(stored, task, proxy, option)
-
-
-def _proxies_of(
-    stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str
-) -> ProxySet:
+    stored = header.read(source, option, () if kind is None else (kind,), single)
     env = _env_of(stored, task, proxy, option)
     path, tensors, learned = stored
     if not learned.is_set:

@@ -58,15 +58,15 @@ class SyntheticConfig(ProxyConfig):
         d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1). Agents
         see all ends but the first.
       min_steps: First step of an episode that d may end it at; before it, targets bootstrap with 1.
-        An SE of episodes of a step or two is a bandit, whatever its networks could do.
+        An SE of episodes of a step or two is a one-step SE, whatever its networks could do.
       initial_state: real: the task's initial states; learned: standard normal noise plus a
         network's output for it; noise: noise alone, in the units of `state_units`.
       state_units: Units in which the networks see and make states. raw: the task's own; bounds: 0
         is the middle of a bounded observation and 1 is half of the way to its bound. A car's
         velocity lies in [-0.07, 0.07], where noise of 1 would be no measure.
       horizon: Steps of an episode, the last of which terminates it; null: the task's limit, which
-        truncates it. 1: a contextual bandit, which has neither a next-state nor a done network.
-      reward_form: What the reward network of a bandit makes. network: the reward of an action;
+        truncates it. 1: a one-step SE, which has neither a next-state nor a done network.
+      reward_form: What the reward network of a one-step SE makes. network: the reward of an action;
         distance: the best of continuous actions, in units of their bound. The reward is minus the
         sum of the distances from it, so that the best policy is known.
     """

@@ -1,6 +1,5 @@
-"""Pictures of runs and evaluations."""
+"""The picture of a run."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,6 @@ from matplotlib.figure import Figure
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
-AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
-PANELS = {
-    "test_return": "return on the real task",
-    "train_steps": "training steps",
-    "train_episodes": "training episodes",
-}
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
@@ -45,14 +38,14 @@ def learning_curve(
             lines, figsize=(7, 2.5 + 1.5 * lines), sharex=True, height_ratios=(2, 1)[:lines]
         )
         top, bottom = figure.axes[0], figure.axes[-1]
-        label = "incumbent: mean and std over fresh agents"
+        label = "search mean: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
         top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
-        for agent, color in zip(agents, itertools.cycle(AGENTS)):
-            style: dict[str, Any] = {"color": color, "lw": 1.3, "ls": "-."}
-            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"incumbent: {agent}", **style)
+        for i, agent in enumerate(agents):
+            style: dict[str, Any] = {"color": f"C{i}", "lw": 1.3, "ls": "-."}
+            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
             if lines > 1:
                 bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)
         if solved_score is not None:
@@ -66,52 +59,6 @@ def learning_curve(
             bottom.plot(x, steps["train_steps_mean"], color=STEPS, lw=1.8)
             bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
         bottom.locator_params(axis="x", integer=True)
-        _write(figure, path)
-
-
-def evaluation(
-    tables: Mapping[tuple[str, str], Mapping[str, Any]],
-    solved_reward: float | None,
-    path: Path,
-    title: str,
-) -> None:
-    """Draws what agents trained in each world reached and, where it varies, what it took.
-
-    A point for each agent; the mean as a line and a number.
-
-    Args:
-      tables: by world and agent, columns `test_return`, `train_steps` and `train_episodes`, each
-        with a number for each agent.
-      solved_reward: the task's threshold; None or infinite if there is none.
-      path: the picture.
-      title: who was trained.
-    """
-    worlds = list(dict.fromkeys(world for world, _ in tables))
-    is_one = len(worlds) == len(tables)  # agent
-    labels = [f"trained on\n{world}" if is_one else f"{key}\n{world}" for world, key in tables]
-    numbers = {name: np.concatenate([x[name] for x in tables.values()]) for name in PANELS}
-    panels = [name for name in PANELS if name == "test_return" or np.ptp(numbers[name])]
-    with plt.rc_context(STYLE):
-        size = len(panels) * max(3, 1.3 * len(tables)), 3.4
-        figure, axes = plt.subplots(1, len(panels), squeeze=False, figsize=size)
-        figure.suptitle(title, fontsize=11)
-        for axis, column in zip(figure.axes, panels, strict=True):
-            for x, ((world, _), table) in enumerate(tables.items()):
-                values = np.asarray(table[column], float)
-                color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
-                spread = x + np.random.default_rng(0).uniform(-0.15, 0.15, len(values))
-                axis.plot(spread, values, "o", ms=3.5, color=color, alpha=0.45, mew=0)
-                mean = values.mean()
-                axis.hlines(mean, x - 0.28, x + 0.28, color=color, lw=2.5)
-                text = f"{mean:,.{0 if abs(mean) >= 1000 else 1}f}"
-                axis.annotate(text, (x + 0.3, mean), fontsize=9, va="center")
-            axis.set_xticks(range(len(tables)), labels)
-            axis.margins(x=0.2)
-            axis.set_title(PANELS[column], fontsize=10)
-            if column != "test_return":
-                axis.set_ylim(bottom=0)
-        if solved_reward is not None:
-            axes[0, 0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
 
 

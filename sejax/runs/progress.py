@@ -1,87 +1,72 @@
-"""Live lines of progress on a terminal, and the last words of `sejax.run`."""
+"""Lines of progress, and the last words of `sejax.run`."""
 
 import time
-from typing import Self
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sejax.bilevel import Bilevel
 from sejax.options import registry
 from sejax.runs import compose
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
-from sejax.runs.trackers import FinishedGeneration, Reporter
+from sejax.runs.trackers import FinishedGeneration
 
 
-class RunProgress(Progress, Reporter):
-    """One live line on a terminal; one line for each generation elsewhere.
+class RunProgress:
+    """Prints a line for each generation; the first one where settings are not tuned for a task.
 
-    Attributes:
-      is_live: whether it is on a terminal.
+    Args:
+      config: of the run.
+      is_quiet: whether nothing is printed.
     """
 
-    def __init__(self, config: LearnConfig):
-        console = Console(highlight=False, markup=False)
-        self.is_live = console.is_terminal
-        columns = SpinnerColumn(), BarColumn(bar_width=16), TextColumn("{task.description}")
-        left = TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False)
-        super().__init__(*columns, *left, console=console, disable=not self.is_live)
-        self._task = self.add_task("", total=config.generations)
+    def __init__(self, config: LearnConfig, is_quiet: bool = False):
         self._config, self._started, self._steps = config, time.monotonic(), 0
-
-    def __enter__(self) -> Self:
-        env, proxy = self._config.name("env"), self._config.name("proxy")
+        self._is_quiet = is_quiet
+        env, proxy = config.name("env"), config.name("proxy")
         if f"{env}-{proxy}" not in compose.PRESETS:
             self.say(
                 f"There are no tuned settings for env={env} with proxy={proxy}: these are general "
                 "ones, not tuned (docs/defaults.md)."
             )
-        return super().__enter__()
 
     def status(self, text: str) -> None:
-        """Shows what is being done before the first generation."""
-        self.update(self._task, description=text)
+        """Prints what is being done before the first generation."""
         self._started = time.monotonic()
-        if not self.is_live:
-            self.say(f"{text} ...")
+        self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
-        """Prints a line that stays."""
-        self.console.print(text, soft_wrap=True)
+        """Prints a line."""
+        if not self._is_quiet:
+            print(text, flush=True)
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        """Shows the numbers of a generation; steps per second are the session's so far."""
+        """Prints the numbers of a generation; steps per second are the session's so far."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values, agents = info.values, list(self._config.agents)
         means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents[1:] and agents)
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
-            f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
+            f"search mean {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
             f"{means and f' ({means})'}, best {values['best_so_far']:.1f}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         if values["num_nonfinite"]:
             text += f", {values['num_nonfinite']:.0f} diverged"
-        self.update(self._task, completed=info.generation + 1, description=text)
-        if not self.is_live:
-            self.say(text)
+        self.say(text)
 
-    def finish(self, directory: RunDirectory, learner: Bilevel, best: float) -> None:
+    def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how it ended, where everything is, and what to do next."""
-        self.stop()
-        path, solved_score = directory.path, learner.solved_score
+        path, solved_score = directory.path, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
-        verdict = f"best incumbent score {best:.1f}"
-        if learner.scoring.objective.meaning:
-            verdict += f": {learner.scoring.objective.meaning}"
+        verdict = f"best search mean {best:.1f}"
+        if bilevel.scoring.objective.meaning:
+            verdict += f": {bilevel.scoring.objective.meaning}"
         if solved_score is not None:
             verdict = "solved" if is_solved else "not solved"
-            verdict += f": best incumbent mean {best:.1f}, solved at {solved_score:g}"
+            verdict += f": best search mean {best:.1f}, solved at {solved_score:g}"
         ending = "solved" if is_solved else "learned"
-        self.console.rule(f"{learner.proxy.task.name}: {ending}", align="left")
         self.say(
+            f"\n{bilevel.proxy.task.name}: {ending}\n"
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"

@@ -57,7 +57,7 @@ class RunDirectory(Store):
       path: the folder; made, or that of an earlier session of the same run.
       config: the configuration, plain values in nested mappings.
       columns: of `metrics.csv`: with several agents, four more for each of them.
-      rows: the rows of `metrics.csv`, each as text by column.
+      rows: the rows of `metrics.csv`, each as text by column: the generations that are saved.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
       versions: of the packages that decide the numbers, as the checkpoint was written.
@@ -94,11 +94,6 @@ class RunDirectory(Store):
             self.__exit__()
             raise
         return self
-
-    @property
-    def finished_generations(self) -> int:
-        """Generations that are saved."""
-        return len(self.rows)
 
     def last(self, column: str) -> str:
         """The value in the last row that is saved; 0 without one."""

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import jax
 
+import sejax
 from sejax.ops import files
-from sejax.training import require_modes
+from sejax.ops.modes import require_modes
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")  # of a container: "200000 100000", or "max 100000"
 _NEVER_SECONDS = 1_000_000
@@ -101,4 +102,4 @@ def cpu_fingerprint() -> str:
 
 def versions() -> dict[str, str]:
     """Of the packages that decide a run's numbers."""
-    return {name: version(name) for name in ("sejax", "jax", "jaxlib")}
+    return {"sejax": sejax.__version__, "jax": version("jax"), "jaxlib": version("jaxlib")}

@@ -19,17 +19,21 @@ from sejax.ops.files import write_text
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
 from sejax.runs.config import LearnConfig
+from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
-from sejax.runs.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.runs.trackers import FinishedGeneration, GuardedTracker, TrackedRun
 from sejax.runs.workers import Chunks
 from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
-PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
+PACKAGES = ("flax", "optax", "evosax", "gymnax", "numpy")
 
 
 def run(
-    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: Reporter | None = None
+    config: LearnConfig,
+    directory: RunDirectory,
+    chunks: Chunks,
+    report: RunProgress | None = None,
 ) -> dict[str, Any]:
     """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
@@ -37,7 +41,7 @@ def run(
       config: the configuration.
       directory: its folder.
       chunks: the generations of this configuration.
-      report: hears how it goes on.
+      report: hears how it goes on; None: nobody does.
 
     Returns:
       What `run.json` holds. `ended` is finished, solved, or diverged: a run of whose agents none
@@ -47,17 +51,17 @@ def run(
       ConfigError: if the folder's state is that of another version.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    report, learner = report or Reporter(), chunks.learner
+    report, bilevel = report or RunProgress(config, is_quiet=True), chunks.bilevel
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn = time.monotonic()
-    folder, first = directory.path.resolve(), directory.finished_generations
+    folder, first = directory.path.resolve(), len(directory.rows)
     tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
     guarded = GuardedTracker(config.tracker, tracked, report.say)
     with contextlib.closing(guarded) as tracker:
-        while (ended := _ended(config, directory, learner, state)) is None:
-            first = directory.finished_generations
+        while (ended := _ended(config, directory, bilevel, state)) is None:
+            first = len(directory.rows)
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
@@ -65,20 +69,21 @@ def run(
                 wall_s = start_wall_s + time.monotonic()
                 cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
                 rows = directory.save(saved, info, wall_s, cpu_s)
-                save_proxies(directory, learner, saved, first)
+                save_proxies(directory, bilevel, saved, first)
                 for generation in _finished(rows, info):
                     report.on_generation(generation)
                     tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
-                draw(config, directory, learner)
+                draw(config, directory, bilevel)
                 drawn = time.monotonic()
-        draw(config, directory, learner)
-    generations, agents = directory.finished_generations, learner.strategy.num_evaluations
+        draw(config, directory, bilevel)
+    generations, agents = len(directory.rows), bilevel.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
+    versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
         "ended": ended,
         "best_score": float(state.best_score),
-        "solved_score": learner.solved_score,
+        "solved_score": bilevel.solved_score,
         "wall_s": round(start_wall_s + time.monotonic(), 1),
         "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
         "generations": generations,
@@ -87,42 +92,42 @@ def run(
         "real_steps": int(directory.last("env_steps_total")),
         "devices": [str(device) for device in jax.devices()],
         "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
-        "versions": {"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
+        "versions": {"python": platform.python_version()} | versions,
     }
     write_text(directory.path / "run.json", json.dumps(summary, indent=2) + "\n")
     return summary
 
 
-def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: Reporter) -> LearnState:
+def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:
     """A new state or that of the folder, beside which the proxies are written again."""
     state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
     if restored is not None:
-        report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
+        report.say(f"Resuming at generation {len(directory.rows)} of {directory.path}.")
         here, there = runtime.versions(), directory.versions
         if there != here:
             report.say(f"It was made with {there}; here are {here}. Numbers may move.")
         # `stop_when_solved` may have changed.
-        solved = jax.numpy.bool_(chunks.learner.is_solved(restored.best_score))
+        solved = jax.numpy.bool_(chunks.bilevel.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
-        save_proxies(directory, chunks.learner, jax.device_get(state), 0)
+        save_proxies(directory, chunks.bilevel, jax.device_get(state), 0)
     # Buffers of its own, so that they can be donated.
     return jax.tree.map(lambda x: x.copy(), state)
 
 
 def _ended(
-    config: LearnConfig, directory: RunDirectory, learner: Bilevel, state: LearnState
+    config: LearnConfig, directory: RunDirectory, bilevel: Bilevel, state: LearnState
 ) -> str | None:
     """How the run has ended; None if it has not."""
     if state.solved:
         return "solved"
-    if _all_diverged(directory, learner):
+    if _all_diverged(directory, bilevel):
         return "diverged"
-    return "finished" if directory.finished_generations >= config.generations else None
+    return "finished" if len(directory.rows) >= config.generations else None
 
 
 def _advance(
-    chunks: Chunks, state: LearnState, length: int, report: Reporter
+    chunks: Chunks, state: LearnState, length: int, report: RunProgress
 ) -> tuple[LearnState, GenerationInfo]:
     """Runs `length` generations, and returns when they are computed."""
     if length not in chunks.compiled:
@@ -136,9 +141,9 @@ def _advance(
     return state, info
 
 
-def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
+def _all_diverged(directory: RunDirectory, bilevel: Bilevel) -> bool:
     """Whether there are generations, and every agent of each met a number that is not finite."""
-    rows, agents = directory.rows, learner.strategy.num_evaluations
+    rows, agents = directory.rows, bilevel.strategy.num_evaluations
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
@@ -165,25 +170,25 @@ def interrupts_held() -> Iterator[None]:
         signal.raise_signal(heard[0])
 
 
-def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, first: int) -> None:
+def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, first: int) -> None:
     """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
     Where the search mean has diverged, the file before it stays.
 
     Args:
       directory: of the run.
-      learner: the functions of Algorithm 1.
+      bilevel: the functions of Algorithm 1.
       state: after the last generation that is saved, on the host.
       first: the first generation of which no proxy is written yet.
 
     Raises:
       OSError: if a file cannot be written.
     """
-    if _all_diverged(directory, learner):
+    if _all_diverged(directory, bilevel):
         return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
-    first_agent, names = learner.scoring.mixture.agents[0], learner.scoring.mixture.names
+    first_agent, names = bilevel.scoring.mixture.agents[0], bilevel.scoring.mixture.names
     discount = first_agent.discount(first_agent.hparams)
     # What was learned does not depend on the tracker, nor on where it was computed.
     config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
@@ -194,8 +199,8 @@ def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, f
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
             path,
-            learner.proxy,
-            learner.unravel(flat),
+            bilevel.proxy,
+            bilevel.unravel(flat),
             config,
             None if discount is None else float(discount),
             score=float(score),
@@ -205,12 +210,12 @@ def save_proxies(directory: RunDirectory, learner: Bilevel, state: LearnState, f
         )
 
 
-def draw(config: LearnConfig, directory: RunDirectory, learner: Bilevel) -> None:
+def draw(config: LearnConfig, directory: RunDirectory, bilevel: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
         path = directory.path / "learning_curve.png"
         title = ", ".join(map(config.name, ("env", "proxy", "agent")))
-        plots.learning_curve(directory.rows, learner.solved_score, path, title)
+        plots.learning_curve(directory.rows, bilevel.solved_score, path, title)
 
 
 def _finished(rows: list[dict[str, str]], info: GenerationInfo) -> Iterator[FinishedGeneration]:

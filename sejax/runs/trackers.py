@@ -1,4 +1,4 @@
-"""Following a run with other tools: TensorBoard, Weights & Biases, or one of your own.
+"""Following a run with other tools: TensorBoard, or one of your own.
 
 A tracker hears of each generation after the run directory has it. It adds nothing to a run and
 cannot stop it.
@@ -56,19 +56,6 @@ class FinishedGeneration:
     train_steps: int
 
 
-class Reporter:
-    """Hears how a run goes on; this one tells nobody. See `sejax.runs.progress`."""
-
-    def status(self, text: str) -> None:
-        """Hears what is being done now."""
-
-    def say(self, text: str) -> None:
-        """Hears a message that is worth keeping."""
-
-    def on_generation(self, info: FinishedGeneration) -> None:
-        """Hears of a generation after it was saved. What this raises ends the session."""
-
-
 @runtime_checkable
 class Tracker(Protocol):
     """The methods of a tracker, which its configuration makes by `make(run: TrackedRun)`."""
@@ -104,7 +91,7 @@ class GuardedTracker:
         except (Exception, SystemExit) as error:  # foreign code may raise anything
             if not self._has_failed:
                 name = registry.name_of("tracker", self._config)
-                self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
+                self._say(f"tracker={name} has failed; the run continues without. {told(error)}")
             self._has_failed = True
 
 
@@ -140,33 +127,3 @@ class TensorBoardConfig:
             writer.flush()
 
         return SimpleNamespace(on_generation=on_generation, close=writer.close)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WandbConfig:
-    """A run of Weights & Biases; offline with `WANDB_MODE=offline`."""
-
-    package: ClassVar[str] = "wandb"
-    project: str = "sejax"
-
-    def make(self, run: TrackedRun) -> Tracker:
-        import wandb
-
-        logged = wandb.init(
-            project=self.project,
-            name=run.folder.name,
-            id=run.id,
-            resume="allow",
-            dir=str(run.folder),
-            config=run.config,
-            # The console belongs to the progress line; by default wandb waits 90 s for a network.
-            settings=wandb.Settings(console="off", init_timeout=20),
-        )
-
-        def on_generation(info: FinishedGeneration) -> None:
-            values: dict[str, Any] = {"generation": info.generation, **info.values}
-            if info.scores.size:
-                values["population_scores"] = wandb.Histogram(info.scores)
-            logged.log(values, step=info.generation)
-
-        return SimpleNamespace(on_generation=on_generation, close=logged.finish)

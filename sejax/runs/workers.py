@@ -35,35 +35,35 @@ from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
 Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
-BATCH, SHARE = 16, 4  # trainings in a batch whose width nothing says; least ones in a share
+BATCH = 16  # trainings in a share whose size nothing says
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
 
 
 class Chunks:
-    """The generations of a learner in chunks, each length compiled once, ahead of time.
+    """The generations of Algorithm 1 in chunks, each length compiled once, ahead of time.
 
     `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
     the chunk before returned it.
 
     Attributes:
-      learner: the functions of Algorithm 1.
+      bilevel: the functions of Algorithm 1.
       cpu_s: CPU seconds of other processes than this one.
       compiled: the programs of chunks, by their lengths.
     """
 
     cpu_s = 0.0
 
-    def __init__(self, learner: Bilevel):
-        self.learner = learner
-        self.init: Callable[[Array], LearnState] = jax.jit(learner.init)  # before generation 0
+    def __init__(self, bilevel: Bilevel):
+        self.bilevel = bilevel
+        self.init: Callable[[Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
         self.compiled: dict[int, Any] = {}
 
     def compile(self, length: int) -> None:
         """Compiles a chunk of this length."""
 
         def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-            step = self.learner.generation
+            step = self.bilevel.generation
             return jax.lax.scan(lambda state, _: step(state), state, length=length)
 
         state = jax.eval_shape(self.init, jax.random.key(0))
@@ -146,14 +146,13 @@ class RayConfig(Options):
 # --- shares of a generation -----------------------------------------------------------------------
 
 
-def portion_sizes(learner: Bilevel, num_parallel: int | None) -> list[tuple[int, int]]:
-    """Trainings of each agent in a batch, and in a share, which is whole batches.
+def share_sizes(bilevel: Bilevel, num_parallel: int | None) -> list[int]:
+    """Trainings of each agent in a share, which is one batch.
 
     They are the same for any number of workers, because sums over batches of other widths round
     otherwise.
     """
-    widths = [num_parallel or width or BATCH for width in learner.evaluate.widths]
-    return [(width, width * -(-SHARE // width)) for width in widths]
+    return [num_parallel or width or BATCH for width in bilevel.evaluate.widths]
 
 
 class RemoteChunks(Chunks):
@@ -177,7 +176,7 @@ class RemoteChunks(Chunks):
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._compute = compute
-        self._sizes = [size for _, size in portion_sizes(self.learner, config.num_parallel)]
+        self._sizes = share_sizes(self.bilevel, config.num_parallel)
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, of which chunks of any length are made."""
@@ -190,20 +189,20 @@ class RemoteChunks(Chunks):
         Both are one program that runs twice in a generation: in a program of its own XLA would
         round the candidates of `ask` otherwise than in `Bilevel.generation`.
         """
-        learner = self.learner
+        bilevel = self.bilevel
 
         def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
-            candidates = learner.ask(state)
-            trainings = learner.evaluate.trainings(candidates)
+            candidates = bilevel.ask(state)
+            trainings = bilevel.evaluate.trainings(candidates)
             sent = [dataclasses.replace(x, key=jax.random.key_data(x.key)) for x in trainings]
-            return learner.tell(state, candidates, learner.evaluate.joined(by_agent)), sent
+            return bilevel.tell(state, candidates, bilevel.evaluate.joined(by_agent)), sent
 
         def evaluate(state: LearnState) -> list[Outcome]:
-            trainings = learner.evaluate.trainings(learner.ask(state))
-            pairs = zip(learner.evaluate.runs, trainings, strict=True)
+            trainings = bilevel.evaluate.trainings(bilevel.ask(state))
+            pairs = zip(bilevel.evaluate.runs, trainings, strict=True)
             return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
 
-        state = jax.eval_shape(learner.init, jax.random.key(0))
+        state = jax.eval_shape(bilevel.init, jax.random.key(0))
         shapes = jax.eval_shape(evaluate, state)
         no_outcomes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         jitted = jax.jit(generation, compiler_options=compiler_options())
@@ -230,13 +229,13 @@ class RemoteChunks(Chunks):
     def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
         """The outcomes of each agent's trainings, leaves `[training, ...]`."""
         shares: list[Portion] = []
-        for agent, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
+        for agent_index, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
             for start in range(0, len(trainings.active), size):
                 part = slice(start, start + size)
-                shares.append((agent, jax.tree.map(lambda x, part=part: x[part], trainings)))
+                shares.append((agent_index, jax.tree.map(lambda x, part=part: x[part], trainings)))
         parts: list[list[Outcome]] = [[] for _ in by_agent]
-        for (agent, _), (outcome, cpu_s) in zip(shares, self._compute(shares), strict=True):
-            parts[agent].append(outcome)
+        for (agent_index, _), (outcome, cpu_s) in zip(shares, self._compute(shares), strict=True):
+            parts[agent_index].append(outcome)
             self.cpu_s += cpu_s
         return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
 
@@ -256,7 +255,7 @@ def num_workers(machines: RayConfig) -> int:
     if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
         raise FailedError(
             "Ray has ended on this machine, so that no training can be sent out. The generations "
-            "before are saved; start Ray and repeat the command to go on."
+            "before are saved; start Ray and repeat the command to resume."
         )
     return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
@@ -286,7 +285,7 @@ def _on_cluster(
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
         raise FailedError(
             f"A worker has failed: {reason}. The generations before are saved; the same command "
-            f"with machines=local goes on here."
+            f"with machines=local resumes here."
         ) from error
     return results
 
@@ -308,10 +307,10 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
     Raises:
       ConfigError: if this machine has other versions of what decides the numbers.
     """
-    (agent, trainings), started = share, time.process_time()
-    capacity, program = _programs(setup)[agent]
+    (agent_index, trainings), started = share, time.process_time()
+    size, program = _programs(setup)[agent_index]
     # Filled up with copies, for which nothing is computed.
-    n, numbers = len(trainings.active), np.arange(capacity)
+    n, numbers = len(trainings.active), np.arange(size)
     trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
     outcome = program(dataclasses.replace(trainings, active=trainings.active & (numbers < n)))
     outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
@@ -320,7 +319,7 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
 
 @functools.lru_cache(maxsize=1)
 def _programs(setup: str) -> list[tuple[int, Any]]:
-    """Most trainings in a share, and the program that computes them, for each agent of a run."""
+    """The size of a share, and the program that computes one, for each agent of a run."""
     plain, expected = json.loads(setup)
     _use_one_core()
     if (versions := runtime.versions()) != expected:
@@ -328,11 +327,12 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
         must = f"machines must have the same versions everywhere; got {got}"
         raise ConfigError(f"{must}. Set the same versions up there.", "machines")
     runtime.configure_jax()
-    config = configuration.learn_config(plain)
-    learner = make_bilevel(**config.parts() | {"devices": 1})
+    # Who started the run has typed the names of its plugins.
+    config = configuration.learn_config(plain, imports=None)
+    bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
-    def program_of(agent: int, width: int) -> Any:
-        spread = spread_over_devices(learner.evaluate.runs[agent], 1, width)
+    def program_of(agent_index: int, size: int) -> Any:
+        spread = spread_over_devices(bilevel.evaluate.runs[agent_index], 1, size)
 
         def evaluate(sent: Trainings) -> Outcome:
             key = jax.random.wrap_key_data(sent.key)
@@ -341,8 +341,8 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 
         return jax.jit(evaluate, compiler_options=compiler_options())
 
-    sizes = portion_sizes(learner, config.num_parallel)
-    return [(capacity, program_of(agent, width)) for agent, (width, capacity) in enumerate(sizes)]
+    sizes = share_sizes(bilevel, config.num_parallel)
+    return [(size, program_of(i, size)) for i, size in enumerate(sizes)]
 
 
 def _use_one_core() -> None:

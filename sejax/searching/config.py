@@ -22,7 +22,7 @@ FREE = ("trials", "search_dir", "verify", "fresh_seeds", "study", "space", "devi
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchConfig(Options):
+class StudyConfig(Options):
     """The fields of `python -m sejax.search`; all others are those of `sejax.run`.
 
     The defaults are the paper's setting, BOHB with a reduction factor of 3 (appendix, "SE
@@ -67,7 +67,7 @@ class SearchConfig(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class StudyPlan:
     """What is searched.
 
     Attributes:
@@ -76,7 +76,7 @@ class Search:
       space: dimensions by the field's name.
     """
 
-    config: SearchConfig
+    config: StudyConfig
     fixed: tuple[str, ...]
     space: dict[str, spaces.Dimension]
 
@@ -113,10 +113,10 @@ class Search:
         return {**self.default.plain(), **to_plain(self.config), "ranges": ranges}
 
 
-def read(overrides: Sequence[str]) -> Search:
+def read(overrides: Sequence[str]) -> StudyPlan:
     """A search from its command's overrides.
 
-    Those that name a field of `SearchConfig` set it, ranges and choices are searched, and all
+    Those that name a field of `StudyConfig` set it, ranges and choices are searched, and all
     others stay fixed. A field that is fixed, also by a preset file, or has a range of its own is
     left out of `space=`.
 
@@ -126,7 +126,7 @@ def read(overrides: Sequence[str]) -> Search:
     values, fixed, space = {}, [], {}
     for override in overrides:
         name, _, text = override.partition("=")
-        if name in fields_of(SearchConfig):
+        if name in fields_of(StudyConfig):
             values[name] = text
         elif spaces.is_range(text):
             space[name] = spaces.parse(name, text)
@@ -135,8 +135,8 @@ def read(overrides: Sequence[str]) -> Search:
         must = f"must be left out, as the search sets it; got {shortened(text)}"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
         require(name.partition(".")[0] not in TAKEN, name, f"{must}. {fix}")
-    config, others = from_plain(SearchConfig, values, ""), compose.read(fixed)
-    search = Search(config=config, fixed=tuple(fixed), space=space)
+    config, others = from_plain(StudyConfig, values, ""), compose.read(fixed)
+    search = StudyPlan(config=config, fixed=tuple(fixed), space=space)
     default, fields = search.default, configuration.words_of(search.default)
     if config.space is not None:
         agents = {

@@ -28,14 +28,14 @@ from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
-from sejax.searching.config import FREE, REDUCTION_FACTOR, Search
+from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
 
 WAIT = {"connect_args": {"timeout": 3600}}  # s, for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # what a database raises
 SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # of a trial
 
 
-def open_study(search: Search) -> optuna.Study:
+def open_study(search: StudyPlan) -> optuna.Study:
     """Makes the study, whose first trial has the current settings, or opens it if it is there.
 
     Raises:
@@ -124,7 +124,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     return run
 
 
-def work(study: optuna.Study, search: Search) -> None:
+def work(study: optuna.Study, search: StudyPlan) -> None:
     """Takes trials until as many as asked for have ended.
 
     With several workers a few more may end, as each looks before it takes one.
@@ -141,7 +141,7 @@ def work(study: optuna.Study, search: Search) -> None:
             print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
 
 
-def _claimed(study: optuna.Study, search: Search, held: contextlib.ExitStack) -> Trial | None:
+def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack) -> Trial | None:
     """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
     known = study.get_trials(deepcopy=False)
     space = {x.parameter: x.distribution for x in search.space.values()}
@@ -190,7 +190,7 @@ def _is_behind(trial: Trial, rung: int) -> bool:
     return bool(trial.user_attrs[name])
 
 
-def _computed(trial: Trial, search: Search) -> str:
+def _computed(trial: Trial, search: StudyPlan) -> str:
     """Computes a trial rung by rung, until it is pruned or complete; what is said of it."""
     study, overrides = trial.study, search.overrides(trial.params)
     folder, seeds = search.folder / _name(trial.number), range(search.config.seeds)
@@ -224,14 +224,14 @@ def _name(number: int) -> str:
     return f"trials/{number:04d}"
 
 
-def _lock(search: Search, name: str, timeout: float = -1) -> filelock.FileLock:
+def _lock(search: StudyPlan, name: str, timeout: float = -1) -> filelock.FileLock:
     return filelock.FileLock(search.folder / f"{name}.lock", timeout=timeout)
 
 
 # --- results --------------------------------------------------------------------------------------
 
 
-def report(study: optuna.Study, search: Search) -> None:
+def report(study: optuna.Study, search: StudyPlan) -> None:
     """Prints and writes the results; the best settings are tried again.
 
     Raises:
@@ -260,7 +260,7 @@ def report(study: optuna.Study, search: Search) -> None:
     print(f"\nThe best:\n  {line}\n{search.folder} holds trials.csv, best.txt and preset.yaml.")
 
 
-def _tried_again(study: optuna.Study, search: Search, number: int) -> dict[str, float]:
+def _tried_again(study: optuna.Study, search: StudyPlan, number: int) -> dict[str, float]:
     """What the settings of a trial are worth with seeds that no trial has had, and what it costs.
 
     The best score of many is the luckiest too.
@@ -272,7 +272,7 @@ def _tried_again(study: optuna.Study, search: Search, number: int) -> dict[str, 
     return {"verified": float(progress.scores[-1]), "verified_cost": progress.generations}
 
 
-def write_best(overrides: Sequence[str], search: Search) -> str:
+def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     """Writes settings as a command, which is returned, and as a preset."""
     words = [*search.fixed, *overrides]
     line = shlex.join(["python", "-m", "sejax.run", *words])
