@@ -272,9 +272,11 @@ def test_the_info_of_an_unknown_task_is_not_known(stored_rn):
 
 
 def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
-    rn = registry.make("proxy", RewardConfig(hidden_size=2), envs.make("pendulum"))
-    path = tmp_path / "rn.safetensors"
-    weights = random_like(shapes_of(rn.init_weights, KEY))
-    sejax.save(path, rn, weights, config={"env": {"name": "gymnax/Pendulum-v1"}}, discount=0.9)
-    assert refused(make, path) == "task"
-    assert make(path, "Pendulum-v1").reset(seed=0)[0].shape == (3,)
+    for task in ({"name": "gymnax/Pendulum-v1"}, {"name": "halfcheetah", "backend": "spring"}):
+        env = envs.make("pendulum")
+        rn = registry.make("proxy", RewardConfig(hidden_size=2), env)
+        path = tmp_path / "rn.safetensors"
+        weights = random_like(shapes_of(rn.init_weights, KEY))
+        sejax.save(path, rn, weights, config={"env": task}, discount=0.9)
+        assert refused(make, path) == "task"
+        assert make(path, "Pendulum-v1").reset(seed=0)[0].shape == (3,)

@@ -1,5 +1,6 @@
-"""What only the reward networks of HalfCheetah can see, and settings that no task has."""
+"""HalfCheetah on brax, and what only its reward networks can see."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,13 @@ from support import has_compiler, numpy_forward, refused
 
 import sejax
 from sejax import envs
+from sejax.envs.environment import EnvState
 from sejax.proxies.reward import RewardConfig
+
+# brax calls parts of MuJoCo XLA that have been given other names.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore:Brax System:UserWarning"
+)
 
 GAMMA = 0.98
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (5, 6)).astype(np.float32)
@@ -28,6 +35,27 @@ def walk_of(env, params):
         return obs, *jax.lax.scan(step, state, jnp.asarray(ACTIONS))[1]
 
     return jax.device_get(jax.jit(walk)(KEY))
+
+
+@pytest.mark.slow
+def test_steps_are_braxs():
+    brax_env = pytest.importorskip("brax.envs.half_cheetah").Halfcheetah(backend="mjx")
+    task = envs.make("halfcheetah", backend="mjx")
+
+    def walk_in_brax(actions):
+        def step(state, action):
+            state = brax_env.step(state, action)
+            return state, (state.obs, state.reward, state.metrics)
+
+        return jax.lax.scan(step, brax_env.reset(KEY), actions)[1]
+
+    _, obs, reward, terminated, info = walk_of(task.env, task.params)
+    expected = jax.jit(walk_in_brax)(ACTIONS)
+    metrics = {name: info[name] for name in expected[2]}
+    chex.assert_trees_all_close((obs, reward, metrics), expected, rtol=1e-4, atol=1e-5)
+    assert not terminated.any() and (info["discount"] == 1.0).all()
+    late = EnvState(time=jnp.array([999, 1000]))
+    assert list(task.env.is_truncated(late, task.params)) == [False, True]
 
 
 @needs_compiler
@@ -62,7 +90,7 @@ WEIGHTED = "proxy.variant=exclusive_weighted_info"
 @pytest.mark.parametrize(
     ("overrides", "field"),
     [
-        ([ENV, RN, "env.backend=mjx"], "env.backend"),
+        ([ENV, RN, "env.backend=sprung"], "env.backend"),
         ([ENV, "preset=paper"], "preset"),
         (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented"),  # has no v
         (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "proxy.variant"),

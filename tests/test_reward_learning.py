@@ -10,7 +10,10 @@ from sejax.bilevel import make_learner
 from sejax.options import registry
 from sejax.proxies.reward import VARIANTS
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Brax System:UserWarning"),
+]
 TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
 # Each of its agents makes 1,200 steps of a large network: a network and weighted info, at two
 # objectives.

@@ -31,7 +31,7 @@ def make(name: str, **options: object) -> Task:
 
     Args:
       name: one of `names()`, `gymnax/` and an id that gymnax knows, or `module:attribute`.
-      **options: fields of its configuration, as `goal_reward=-1` for cliff_walking.
+      **options: fields of its configuration, as `backend="spring"` for halfcheetah.
 
     Raises:
       ConfigError: for an unknown name or option, the known ones nearest first; or if it needs a

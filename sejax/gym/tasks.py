@@ -104,7 +104,7 @@ def real_env(header: Header, **options: Any) -> Env:
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
-    fields.pop("backend", None)  # MuJoCo, as there
+    is_known &= fields.pop("backend", "mujoco") != "spring"  # whose dynamics are others
     must = "must be given, because Gymnasium has none that is the same"
     fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
     require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")

@@ -2,5 +2,6 @@
 
 `tasks` has the tasks, and `environment` what they have in common. `physics` is a model's reset and
 step in JAX; `step.cc` calls MuJoCo from within compiled programs, and `library` builds it. They
-need the extra `mujoco`, a C++ compiler when they are first used, and the CPU.
+need the extra `mujoco`, a C++ compiler when they are first used, and the CPU. `brax` has other
+physics for halfcheetah.
 """

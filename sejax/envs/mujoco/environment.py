@@ -34,6 +34,7 @@ class MujocoTask(Options):
       num_hidden: positions that are not observed, the first ones.
       with_forces: whether external forces are needed.
       normal_velocities: whether those of a reset are normal, else uniform.
+      otherwise: what else can be done where MuJoCo cannot be used, for messages.
       terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some.
       reset_noise_scale: range or deviation of what is drawn at a reset; an option of some.
     """
@@ -45,6 +46,7 @@ class MujocoTask(Options):
     num_hidden: ClassVar[int] = 1
     with_forces: ClassVar[bool] = False
     normal_velocities: ClassVar[bool] = False
+    otherwise: ClassVar[str] = ""
     terminate_when_unhealthy = True
     reset_noise_scale = 0.1
 
@@ -71,7 +73,7 @@ class MujocoTask(Options):
             why = str(error)
             if isinstance(error, ImportError):
                 why = f"needs the extra; {error}. Type pip install 'sejax[mujoco]'"
-            raise ConfigError(f"env={self.name} {why}.", "env") from error
+            raise ConfigError(f"env={self.name} {why}{self.otherwise}.", "env") from error
         return Task.of(self.spec, name=self.name, env=MujocoEnv(self))
 
     @property

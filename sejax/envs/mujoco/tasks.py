@@ -8,7 +8,10 @@ Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
 """
 
 import dataclasses
+import io
 import math
+import warnings
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,12 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sejax.envs.base import Task
 from sejax.envs.mujoco.environment import MujocoTask, Scalars
 from sejax.envs.spec import Box, TaskSpec
-from sejax.options import finite, not_negative, option, require, shortened
+from sejax.options import ConfigError, finite, not_negative, one_of, option
 
 if TYPE_CHECKING:  # it imports mujoco
     from sejax.envs.mujoco.physics import Report
+
+# Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
+# MuJoCo, at ten times its cost on a CPU (docs/mujoco.md).
+BACKENDS = ("mujoco", "mjx", "spring")
 
 # The entries of `info` that describe the state alone; an observation has no position along x or y.
 _STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
@@ -45,12 +53,6 @@ def _spec(
     )
 
 
-def _require_mujoco(field: str, backend: object, default: object) -> None:
-    """Checks the physics of halfcheetah, which files of proxies name."""
-    fix = "brax is in an example: set env=other_suites:task env.suite=brax in the folder examples/"
-    require(backend == default, field, f"must be {default}; got {shortened(backend)}. {fix}.")
-
-
 def _control_cost(action: Float[Array, " nu"], weight: float) -> Float[Array, ""]:
     """The part of the reward that charges for control."""
     return -weight * jnp.sum(action**2)
@@ -69,16 +71,33 @@ class HalfCheetah(MujocoTask):
 
     Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
 
-    Differs: `info` has the name of v3, `reward_run`, for what v5 calls `reward_forward`.
+    Differs: `info` has the name of v3, `reward_run`, for what v5 calls `reward_forward`, as sejax's
+    other physics do.
     """
 
     name = "halfcheetah"
     file = "half_cheetah.xml"
     frame_skip = 5
     normal_velocities = True
+    otherwise = ", or set env.backend=mjx"
     spec = _spec(17, 6, solved_reward=3000.0, info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"))
 
-    backend: str = option("mujoco", _require_mujoco)
+    backend: str = option("mujoco", one_of(BACKENDS))
+
+    def make(self) -> Task:
+        if self.backend == "mujoco":
+            return super().make()
+        try:
+            # On import brax prints notes on other physics and warns of its own envs.
+            with warnings.catch_warnings(action="ignore"), redirect_stdout(io.StringIO()):
+                from sejax.envs.mujoco.brax import BraxHalfCheetahEnv
+
+                brax_env = BraxHalfCheetahEnv(self)
+        except ImportError as error:
+            fix = f"got {self.backend} ({error}). Install it with pip install 'sejax[brax]'"
+            message = f"env.backend must be mujoco without brax; {fix}."
+            raise ConfigError(message, "env.backend") from error
+        return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
         return {"reward_run": self.velocity(now)[0], "reward_ctrl": _control_cost(action, 0.1)}

@@ -1,0 +1,63 @@
+"""HalfCheetah on brax."""
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+from brax.base import State as BraxState
+from brax.envs.base import State
+from brax.envs.half_cheetah import Halfcheetah
+from flax import struct
+from jaxtyping import Array, Float
+
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
+
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import HalfCheetah
+
+# Of mjx's line search, where MuJoCo has 50: under vmap all wait for the longest search. With 10
+# gaits are worth as much as with 50, with 8 no longer (docs/mujoco.md).
+LS_ITERATIONS = 10
+
+
+@struct.dataclass
+class CheetahState(EnvState):
+    physics: BraxState
+
+
+class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
+    r"""A planar cheetah with six joints that is paid for running forward.
+
+    .. math:: r = v_x - 0.1 \lVert a \rVert^2
+
+    Observations are the positions without the torso's x and all velocities, `[17]`; actions are
+    torques, `[6]` in [-1, 1]. An episode never terminates. `info` has the torso's `x_position` (m),
+    its `x_velocity` over the step (m/s), and the reward's parts `reward_run` and `reward_ctrl`.
+
+    Each reset draws an initial state of its own from the key: brax's wrappers, which go back to one
+    cached state, are not used.
+
+    Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
+    """
+
+    def __init__(self, config: "HalfCheetah"):
+        super().__init__(config.spec)
+        self._info_keys = config.spec.info_keys
+        self._brax = Halfcheetah(backend=config.backend)
+        if config.backend == "mjx":
+            self._brax.sys = self._brax.sys.tree_replace({"opt.ls_iterations": LS_ITERATIONS})
+
+    def reset_env(self, key: Array, params: EnvParams) -> tuple[Float[Array, "17"], CheetahState]:
+        state = self._brax.reset(key)
+        return state.obs, CheetahState(physics=state.pipeline_state, time=jnp.int32(0))
+
+    def step_env(
+        self, key: Array, state: CheetahState, action: Array, params: EnvParams
+    ) -> Step[CheetahState]:
+        """One control step of 0.05 s; the key has no effect."""
+        nothing = jnp.float32(0)
+        metrics = dict.fromkeys(self._info_keys, nothing)
+        before = State(state.physics, None, nothing, nothing, metrics)
+        after = self._brax.step(before, action)
+        info = {**after.metrics, "discount": jnp.float32(1)}
+        state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
+        return after.obs, state, after.reward, jnp.bool_(False), info
