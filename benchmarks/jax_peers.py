@@ -131,8 +131,8 @@ def serve(side: str, args: argparse.Namespace) -> None:
         steps = PPO_STEPS if algorithm == "ppo" else WIDTHS[int(width)]
         train = TRAINERS[side](algorithm, int(width), task, world, steps)
         fn = jax.vmap(train) if mode == "vmap" else lambda keys: jax.lax.map(train, keys)
-        lowered = jax.jit(fn).lower(keys(agents))
-        program, times = common.measure(lambda: lowered.compile(sejax.compiler_options()))
+        lowered = jax.jit(fn, compiler_options=sejax.compiler_options()).lower(keys(agents))
+        program, times = common.measure(lowered.compile)
         return program, steps, times["wall_s"]
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from rich.table import Table
 from sejax import agents, envs
 from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
-from sejax.ops.files import require_writable, write_text
+from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import registry, require
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of

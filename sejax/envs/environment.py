@@ -155,6 +155,8 @@ def with_one_done(env: Any) -> Any:
 
     vars(old)["step"] = step
     return old
+
+
 def _gymnax_class() -> Any:
     from gymnax.environments.environment import Environment as GymnaxEnvironment
 
