@@ -105,7 +105,9 @@ def tiny(monkeypatch):
     """Agents and steps that cost nothing."""
 
     def tiny_agent(kind):
-        return registry.configure("agent", {"name": kind, **TINY_AGENT})
+        known = vars(registry.configure("agent", {"name": kind}))
+        small = {name: value for name, value in TINY_AGENT.items() if name in known}
+        return registry.configure("agent", {"name": kind, **small})
 
     monkeypatch.setattr(agents, "agent_config", tiny_agent)
     monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
