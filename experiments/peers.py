@@ -15,7 +15,7 @@ Their weights are not stored here: `theirs` is a folder with the arrays of each 
 import importlib
 import itertools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -162,9 +162,6 @@ def compute(settings: Peers) -> pd.DataFrame:
     return stack({"students": pd.concat(students), "costs": pd.DataFrame(costs)})
 
 
-MEASURES = ("mean", "median", "worst", "solved", "agents")
-
-
 def stock_students(
     settings: Peers, task: Task, sort: str, se: str, source: str
 ) -> Iterator[pd.DataFrame]:
@@ -220,6 +217,13 @@ def our_students(
             yield rows[["test_return"]].assign(seed=seeds, steps=steps, kind=kind)
 
 
+MEASURES = ("mean", "median", "worst", "solved", "agents")
+CELL = (
+    "{SE_mean_N:,.1f} ({SE_median_N:,.1f}, {SE_worst_N:,.1f}; {SE_solved_N:.0%} of "
+    "{SE_agents_N:.0f})"
+)
+
+
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each task, sort of students and algorithm, and for all algorithms of a sort.
 
@@ -251,28 +255,16 @@ def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
     }
     *fewer, most = settings.steps
     for se in SES:
-        for steps in fewer:
-            columns[f"{se}, {steps:,} steps"] = cell(f"{se}_{{}}_{steps}", "{:,.1f}", "mean")
-        form = "{:,.1f} ({:,.1f}, {:,.1f}; {:.0%} of {:.0f})"
-        columns[f"{se}, {most:,} steps"] = cell(f"{se}_{{}}_{most}", form, *MEASURES)
+        columns |= {f"{se}, {steps:,} steps": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
+        columns[f"{se}, {most:,} steps"] = CELL.replace("SE", se).replace("N", str(most))
     note = (
         "Mean returns of agents after so many steps on the SE, in ten episodes of the real task; "
         "after the most steps with median and worst agent, share that solves the task and number "
         "of agents. All: the agents of all algorithms together."
     )
     title = "The same students on our SEs and on synthetic-gymnax's"
-    table = tables.as_texts(summary, columns)
+    table = tables.as_texts(summary, columns).replace("^nan.*", "", regex=True)
     return tables.publish(settings, title, table, summary, note)
-
-
-def cell(column: str, form: str, *measures: str) -> Callable[[Any], str]:
-    """Makes a text of a row's measures; empty where no agent is finished."""
-
-    def text(row: Any) -> str:
-        values = [getattr(row, column.format(measure), np.nan) for measure in measures]
-        return form.format(*values) if np.isfinite(values).all() else ""
-
-    return text
 
 
 def draw(settings: Peers, students: pd.DataFrame) -> None:
