@@ -14,7 +14,8 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from support import random_like, refuse, refused, shapes_of
+from flax.traverse_util import unflatten_dict
+from support import numpy_forward, random_like, refuse, refused, shapes_of
 
 import experiments
 import sejax
@@ -164,20 +165,14 @@ def test_an_experiment_says_what_it_is_and_refuses_other_words(name, tmp_path, c
 
 def test_an_se_of_synthetic_gymnax_as_one_of_sejax_is_the_same(published):
     file, task, key = published / "cartpole.npz", sejax.envs.make("cartpole_v1"), jax.random.key(0)
-    theirs = np.load(file)
-
-    def network(name, x):
-        for layer in (f"params/{name}/Dense_0", f"params/{name}/Dense_1"):
-            x = np.maximum(x, 0) if layer.endswith("1") else x
-            x = x @ theirs[f"{layer}/kernel"] + theirs[f"{layer}/bias"]
-        return x
-
+    theirs = unflatten_dict({name: x.T for name, x in np.load(file).items()}, sep="/")["params"]
     env, weights = peers.converted(file, task)
     obs, state = env.reset_env(key, env.params(weights))
-    noise = jax.random.normal(key, (4,))
-    np.testing.assert_allclose(obs, network("initial_state", noise), atol=1e-5)
     _, _, reward, terminated, _ = env.step_env(key, state, 1, env.params(weights))
-    np.testing.assert_allclose(reward, network("reward", np.array([*obs, 0, 1]))[0], rtol=1e-5)
+    start = numpy_forward(theirs["initial_state"], jax.random.normal(key, (4,)), "relu", 1)
+    np.testing.assert_allclose(obs, start, atol=1e-5)
+    paid = numpy_forward(theirs["reward"], np.array([*obs, 0, 1]), "relu", 1)
+    np.testing.assert_allclose(reward, paid[0], rtol=1e-5)
     assert terminated and refused(peers.converted, published / "acrobot.npz", task) == "theirs"
 
 
