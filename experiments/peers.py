@@ -247,7 +247,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 
 def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(rows)
-    draw(settings, unstack(rows, "students"))
+    draw(settings, summary)
     columns: dict[str, Any] = {
         "task": "{task}",
         "students": "{label}",
@@ -267,30 +267,19 @@ def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, table, summary, note)
 
 
-def draw(settings: Peers, students: pd.DataFrame) -> None:
-    """Draws what every agent scores after the most steps, and the means: a panel for each task."""
-    last = students[students["steps"] == students["steps"].max()]
-    tasks, places = list(last["task"].unique()), {sort: i for i, sort in enumerate(STUDENTS)}
-    size = (1.0 + 2.5 * len(tasks), 3.4)
+def draw(settings: Peers, summary: pd.DataFrame) -> None:
+    """Draws mean scores against steps on the SE, a panel for each task."""
+    tasks = dict(list(summary[summary["kind"] == ALL].groupby("task", sort=False)))
+    size = (1.0 + 2.4 * max(len(tasks), 2), 3.4)
     with figures.panels(settings.folder / "peers.png", 1, len(tasks), size) as (figure, axes):
-        for axis, name in zip(axes[0], tasks, strict=True):
-            here = last[last["task"] == name]
-            for shift, (se, color) in zip((-0.2, 0.2), SES.items(), strict=True):
-                mine = here[here["se"] == se].copy()
-                mine["place"] = mine["students"].map(places) + shift
-                jitter = 0.02 * (mine["seed"] % 11 - 5)
-                how: dict[str, Any] = {"color": color, "label": f"trained on {se}"}
-                axis.plot(
-                    mine["place"] + jitter, mine["test_return"], "o", ms=2.5, alpha=0.4, **how
-                )
-                axis.plot(
-                    mine.groupby("place")["test_return"].mean(), "_", ms=14, mew=2, color=color
-                )
-            figures.threshold(axis, envs.make(name).solved_reward, "solved")
-            labels = [text.replace(", ", "\n") for text in STUDENTS.values()]
-            axis.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60)
-            axis.set_title(name, fontsize=10)
-        axes[0, 0].set_ylabel("score of an agent")
+        for axis, (name, sorts) in zip(axes[0], tasks.items(), strict=True):
+            for row, (se, color) in itertools.product(sorts.itertuples(), SES.items()):
+                means = [getattr(row, f"{se}_mean_{steps}", np.nan) for steps in settings.steps]
+                style = dict(zip(STUDENTS, ("o-", "s--", "^:", "v-."), strict=True))[row.students]
+                axis.plot(settings.steps, means, style, color=color, label=f"{row.label}: {se}")
+            figures.threshold(axis, envs.make(name).solved_reward)
+            axis.set(title=name, xlabel="steps on the SE")
+        axes[0, 0].set_ylabel("mean score on the task")
         figures.legend_above(figure, axes[0, 0])
 
 
