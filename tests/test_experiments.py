@@ -19,7 +19,7 @@ from support import numpy_forward, random_like, refuse, refused, shapes_of
 
 import experiments
 import sejax
-from experiments import peers, score_transforms
+from experiments import peers
 from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
@@ -50,7 +50,6 @@ TINY = {
     "rn_heatmap": RNS,
     "rn_objectives": f"{CURVES} objectives=[reward_threshold,auc]",
     "rn_performance": CURVES,
-    "score_transforms": "runs=3 generations=2 population=2 transforms=rank",
     "se_distilled": "env=cartpole students=ddqn run.training.max_steps=60 "
     "run.training.max_episodes=60",
     "se_dynamics": "kinds=[bandit,threshold] students=ddqn runs=1 generations=2 num_agents=2 "
@@ -111,11 +110,10 @@ def tiny(monkeypatch):
         return registry.configure("agent", {"name": kind, **small})
 
     monkeypatch.setattr(agents, "agent_config", tiny_agent)
-    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
 
 
 def refuse_to_compute(monkeypatch):
-    places = {agents: "train", workers.Chunks: "advance", score_transforms: "compute_cell"}
+    places = {agents: "train", workers.Chunks: "advance"}
     for place, name in places.items():
         monkeypatch.setattr(place, name, refuse)
 
