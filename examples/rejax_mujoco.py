@@ -1,11 +1,12 @@
 """PPO of rejax on MuJoCo's HalfCheetah: physics, agent and tests are one compiled JAX program.
 
     pip install '.[mujoco]' rejax
-    python rejax_mujoco.py --steps 1000000 --agents 2
+    python rejax_mujoco.py
 
-The physics is Gymnasium's HalfCheetah-v5 (`sejax.envs`, on the CPU). Settings are RL Zoo's but for
-its network and initial deviations. Scores are those of whole episodes, before training and as it
-goes.
+The physics is Gymnasium's HalfCheetah-v5, on the CPU. Scores are means of whole episodes, before
+training and as it goes. It takes minutes:
+
+    score on halfcheetah every 40,960 steps: -445 -187 253 482 634 769
 """
 
 import argparse
@@ -20,18 +21,18 @@ import sejax
 def main() -> None:
     parser = argparse.ArgumentParser(description="Trains rejax's PPO on HalfCheetah.")
     parser.add_argument("--env", default="halfcheetah", help="a task of sejax.envs")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="of each training")
-    parser.add_argument("--test-every", type=int, default=100_000, help="steps")
+    parser.add_argument("--steps", type=int, default=204_800, help="of each training")
+    parser.add_argument("--test-every", type=int, default=40_960, help="steps")
     parser.add_argument("--agents", type=int, default=1)
-    parser.add_argument("--rollout", type=int, default=512, help="steps")
+    parser.add_argument("--rollout", type=int, default=2048, help="steps")
     args = parser.parse_args()
     task = sejax.envs.make(args.env)
     algorithm = rejax.PPO.create(
         env=sejax.envs.with_one_done(task.env), env_params=task.params, num_envs=1,
         total_timesteps=args.steps, eval_freq=args.test_every, num_steps=args.rollout,
-        num_minibatches=8, num_epochs=20, learning_rate=2.0633e-5, gamma=0.98, gae_lambda=0.92,
-        clip_eps=0.1, ent_coef=0.0004, vf_coef=0.58, max_grad_norm=0.8,
-        normalize_observations=True,
+        num_minibatches=args.rollout // 64, num_epochs=10, learning_rate=3e-4, gamma=0.99,
+        gae_lambda=0.95, clip_eps=0.2, ent_coef=0.0, vf_coef=0.5, max_grad_norm=0.5,
+        normalize_observations=True, normalize_rewards=True,
     )  # fmt: skip
     keys = jax.random.split(jax.random.key(0), args.agents)
     _, (_, returns) = jax.jit(jax.vmap(algorithm.train))(keys)  # [agent, test, episode]

@@ -30,7 +30,7 @@ from experiments.common.agents import Condition, Group, shipped
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
-from sejax.options import each_of, require
+from sejax.options import ConfigError, each_of, require
 
 BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
 STOCK = {True: ("ppo", "a2c", "dqn"), False: ("ppo", "a2c", "sac", "td3")}  # for discrete actions
@@ -54,7 +54,8 @@ class Published(NamedTuple):
       trainings: of a generation, of 10,000 steps each: one an SE of the population and, with each
         algorithm, 64 on the search mean.
       real_steps: of the 50 test episodes after a training, at most.
-      cpu_s: of a generation on one core; docs/studies/peers.md says how it was estimated.
+      cpu_s: of a generation on one core: an estimate, of four trainings of each algorithm at the
+        published weights that were timed in one batch, with their script and purerl at 2d0e75d.
     """
 
     file: str
@@ -67,11 +68,13 @@ class Published(NamedTuple):
 # Source: synthetic_gymnax/checkpoints/*/config.yaml of https://github.com/keraJLi/synthetic-gymnax
 # at 43e6479. The limit of MountainCar's episodes falls from 1,000 to 200 steps: 600 on average.
 PUBLISHED = {
-    "cartpole_v1": Published("cartpole", 300, 128 + 3 * 64, 50 * 500, 485),
-    "acrobot": Published("acrobot", 100, 128 + 3 * 64, 50 * 500, 0),
-    "mountain_car": Published("mountaincar", 1000, 128 + 3 * 64, 50 * 600, 0),
-    "mountain_car_continuous": Published("continuous_mountaincar", 300, 128 + 4 * 64, 50 * 999, 0),
-    "pendulum": Published("pendulum", 1000, 8 * 64 + 4 * 64, 50 * 200, 0),
+    "cartpole_v1": Published("cartpole", 300, 128 + 3 * 64, 50 * 500, 297),
+    "acrobot": Published("acrobot", 100, 128 + 3 * 64, 50 * 500, 329),
+    "mountain_car": Published("mountaincar", 1000, 128 + 3 * 64, 50 * 600, 318),
+    "mountain_car_continuous": Published(
+        "continuous_mountaincar", 300, 128 + 4 * 64, 50 * 999, 807
+    ),
+    "pendulum": Published("pendulum", 1000, 8 * 64 + 4 * 64, 50 * 200, 1416),
 }
 
 
@@ -133,7 +136,7 @@ def converted(path: Path, task: Task) -> tuple[Any, Any]:
 
 
 def compute(settings: Peers) -> pd.DataFrame:
-    """Trains what is missing: a row for each agent and number of steps, and one for each SE."""
+    """Trains what is missing: a row for each agent and number of steps, and one for each task."""
     students, costs = [], []
     for name in settings.tasks:
         task, published = envs.make(name), PUBLISHED[name]
@@ -142,29 +145,37 @@ def compute(settings: Peers) -> pd.DataFrame:
         sources = dict(zip(SES, (name, str(file)), strict=True))
         for sort, (se, source) in itertools.product(settings.students, sources.items()):
             train = stock_students if sort.startswith("sb3") else our_students
-            tables = train(settings, task, sort, se, source)
-            students += [rows.assign(task=name, students=sort, se=se) for rows in tables]
-        trainings = published.generations * published.trainings
-        theirs = trainings * 10_000, trainings * published.real_steps
-        learned = shipped(name).learning
-        for se, steps, cpu_s in (
-            ("ours", (learned.train_steps, learned.real_steps), learned.cpu_s),
-            ("theirs", theirs, published.generations * published.cpu_s),
-        ):
-            cost = dict(zip(COSTS, (*steps, cpu_s / 3600), strict=True))
-            costs.append({"task": name, "se": se} | cost)
+            trained = train(settings, task, sort, se, source)
+            students += [rows.assign(task=name, students=sort, se=se) for rows in trained]
+        trainings, learned = published.generations * published.trainings, shipped(name).learning
+        costs.append(
+            {
+                "task": name,
+                "ours_se_steps": learned.train_steps,
+                "ours_real_steps": learned.real_steps,
+                "ours_cpu_hours": learned.cpu_s / 3600,
+                "theirs_se_steps": trainings * 10_000,
+                "theirs_real_steps": trainings * published.real_steps,
+                "theirs_cpu_hours": published.generations * published.cpu_s / 3600,
+            }
+        )
     return stack({"students": pd.concat(students), "costs": pd.DataFrame(costs)})
-
-
-COSTS = ("se_steps", "real_steps", "cpu_hours")
 
 
 def stock_students(
     settings: Peers, task: Task, sort: str, se: str, source: str
 ) -> Iterator[pd.DataFrame]:
-    """Agents of Stable-Baselines3, a cached shard for each."""
+    """Agents of Stable-Baselines3, a cached shard for each.
+
+    Raises:
+      ConfigError: without that library.
+    """
     sys.path.append(BENCHMARKS)
-    stock_agents = importlib.import_module("stock_agents")
+    try:
+        stock_agents = importlib.import_module("stock_agents")
+    except ImportError as error:
+        fix = "Type pip install 'sejax[bench]', or set students=[sejax_default,sejax_varied]"
+        raise ConfigError(f"students must be installed; got {error}. {fix}.", "students") from error
     seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
     for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):
         agent = kind.upper() if sort == "sb3_defaults" else kind
@@ -206,21 +217,28 @@ def our_students(
             yield rows[["test_return"]].assign(seed=seeds, steps=steps, kind=kind)
 
 
+MEASURES = ("mean", "median", "worst", "solved", "agents")
+CELL = (
+    "{SE_mean_N:,.1f} ({SE_median_N:,.1f}, {SE_worst_N:,.1f}; {SE_solved_N:.0%} of "
+    "{SE_agents_N:.0f})"
+)
+
+
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each task, sort of students and algorithm, and for all algorithms of a sort.
 
     Columns begin with whose SEs they are of, and end with the steps: `ours_mean_2000`.
     """
-    students, costs = unstack(rows, "students"), unstack(rows, "costs").set_index(["task", "se"])
+    students = unstack(rows, "students")
 
     def statistics(mine: pd.DataFrame) -> dict[str, Any]:
         name = mine["task"].iloc[0]
-        columns: dict[str, Any] = {}
+        columns: dict[str, Any] = {"label": STUDENTS[mine["students"].iloc[0]]}
         for (se, steps), returns in mine.groupby(["se", "steps"])["test_return"]:
-            measured = returns.agg(["size", "mean", "median", "min"]).to_dict()
-            measured["solved"] = (returns >= envs.make(name).solved_reward).mean()
-            columns |= {f"{se}_{what}_{steps:.0f}": x for what, x in measured.items()}
-            columns |= {f"{se}_{what}": costs.loc[(name, se), what] for what in COSTS}
+            solved = (returns >= envs.make(name).solved_reward).mean()
+            values = returns.mean(), returns.median(), returns.min(), solved, len(returns)
+            for measure, value in zip(MEASURES, values, strict=True):
+                columns[f"{se}_{measure}_{steps:.0f}"] = value
         return columns
 
     both = pd.concat([students.assign(kind=ALL), students])
@@ -229,52 +247,39 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 
 def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(rows)
-    draw(settings, unstack(rows, "students"))
+    draw(settings, summary)
     columns: dict[str, Any] = {
         "task": "{task}",
-        "students": lambda row: STUDENTS[row.students],
+        "students": "{label}",
         "algorithm": lambda row: row.kind if row.kind == ALL else figures.agent_name(row.kind),
     }
     *fewer, most = settings.steps
-    last = ("{{{0}_mean_{1}:,.1f}} ({{{0}_median_{1}:,.1f}}, {{{0}_min_{1}:,.1f}}; "
-            "{{{0}_solved_{1}:.0%}} of {{{0}_size_{1}:.0f}})")  # fmt: skip
     for se in SES:
         columns |= {f"{se}, {steps:,} steps": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
-        columns[f"{se}, {most:,} steps"] = last.format(se, most)
+        columns[f"{se}, {most:,} steps"] = CELL.replace("SE", se).replace("N", str(most))
     note = (
         "Mean returns of agents after so many steps on the SE, in ten episodes of the real task; "
         "after the most steps with median and worst agent, share that solves the task and number "
         "of agents. All: the agents of all algorithms together."
     )
     title = "The same students on our SEs and on synthetic-gymnax's"
-    table = tables.as_texts(summary, columns)
+    table = tables.as_texts(summary, columns).replace("^nan.*", "", regex=True)
     return tables.publish(settings, title, table, summary, note)
 
 
-def draw(settings: Peers, students: pd.DataFrame) -> None:
-    """Draws what every agent scores after the most steps, and the means: a panel for each task."""
-    last = students[students["steps"] == students["steps"].max()]
-    tasks, places = list(last["task"].unique()), {sort: i for i, sort in enumerate(STUDENTS)}
-    size = (1.0 + 2.5 * len(tasks), 3.4)
+def draw(settings: Peers, summary: pd.DataFrame) -> None:
+    """Draws mean scores against steps on the SE, a panel for each task."""
+    tasks = dict(list(summary[summary["kind"] == ALL].groupby("task", sort=False)))
+    size = (1.0 + 2.4 * max(len(tasks), 2), 3.4)
     with figures.panels(settings.folder / "peers.png", 1, len(tasks), size) as (figure, axes):
-        for axis, name in zip(axes[0], tasks, strict=True):
-            here = last[last["task"] == name]
-            for shift, (se, color) in zip((-0.2, 0.2), SES.items(), strict=True):
-                mine = here[here["se"] == se].copy()
-                mine["place"] = mine["students"].map(places) + shift
-                jitter = 0.02 * (mine["seed"] % 11 - 5)
-                how: dict[str, Any] = {"color": color, "label": f"trained on {se}"}
-                axis.plot(
-                    mine["place"] + jitter, mine["test_return"], "o", ms=2.5, alpha=0.4, **how
-                )
-                axis.plot(
-                    mine.groupby("place")["test_return"].mean(), "_", ms=14, mew=2, color=color
-                )
-            figures.threshold(axis, envs.make(name).solved_reward, "solved")
-            labels = [text.replace(", ", "\n") for text in STUDENTS.values()]
-            axis.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60)
-            axis.set_title(name, fontsize=10)
-        axes[0, 0].set_ylabel("score of an agent")
+        for axis, (name, sorts) in zip(axes[0], tasks.items(), strict=True):
+            for row, (se, color) in itertools.product(sorts.itertuples(), SES.items()):
+                means = [getattr(row, f"{se}_mean_{steps}", np.nan) for steps in settings.steps]
+                style = dict(zip(STUDENTS, ("o-", "s--", "^:", "v-."), strict=True))[row.students]
+                axis.plot(settings.steps, means, style, color=color, label=f"{row.label}: {se}")
+            figures.threshold(axis, envs.make(name).solved_reward)
+            axis.set(title=name, xlabel="steps on the SE")
+        axes[0, 0].set_ylabel("mean score on the task")
         figures.legend_above(figure, axes[0, 0])
 
 

@@ -23,7 +23,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -150,41 +150,29 @@ def make_recorded_run(
         predict = jax.vmap(lambda s, a: env.predict(env_params.weights, s, a)[:2])
         next_obs, reward = predict(steps.obs, steps.action)
         episode = jnp.arange(steps.reward.shape[0]) // task.max_steps
-        met = trained.recorded.rows
-        is_made = jnp.arange(capacity) < trained.train_steps
-        sources = {
-            "train": (met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
-            "test": (steps.next_obs, steps.reward, episode, steps.valid),
-            "response": (next_obs, reward, episode, steps.valid),
+        met, is_made = trained.recorded, jnp.arange(capacity) < trained.train_steps
+        tested = {"next_obs": steps.next_obs, "reward": steps.reward, "episode": episode}
+        return {
+            "train": {"next_obs": met[:, :-1], "reward": met[:, -1], "valid": is_made},
+            "test": tested | {"valid": steps.valid},
+            "response": {"next_obs": next_obs, "reward": reward, "valid": steps.valid},
         }
-        names = ("next_obs", "reward", "episode", "valid")
-        return {source: dict(zip(names, x, strict=True)) for source, x in sources.items()}
 
     return run
 
 
-class LastSteps(NamedTuple):
-    """What a recorder keeps."""
-
-    rows: Any  # `[capacity, 2 + obs_dim]` of episode, reward and next state, in no order
-    episode: Any  # that goes on, `[]`
-
-
 def last_steps(capacity: int) -> BufferMaker:
-    """A recorder of the last `capacity` steps of a training."""
+    """A recorder of the last `capacity` steps of a training, in no order.
+
+    Its rows are next state and reward, `[capacity, obs_dim + 1]`.
+    """
 
     def make(example: Any, max_steps: int) -> Buffer:
-        def init() -> LastSteps:
-            rows = jnp.zeros((capacity, 2 + example.next_obs.shape[0]))
-            return LastSteps(rows=rows, episode=jnp.int32(0))
+        def init() -> Any:
+            return jnp.zeros((capacity, example.next_obs.shape[0] + 1))
 
-        def store(kept: LastSteps, step: Any, made: Any, ended: Any, active: Any) -> LastSteps:
-            first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
-            row = jnp.concatenate([first, made.next_obs])
-            return LastSteps(
-                rows=write_row(kept.rows, step, row, active),
-                episode=kept.episode + (ended & active),
-            )
+        def store(rows: Any, step: Any, made: Any, ended: Any, active: Any) -> Any:
+            return write_row(rows, step, jnp.append(made.next_obs, made.reward), active)
 
         return Buffer(init=init, store=store, batch=lambda *_: None)
 
@@ -194,15 +182,15 @@ def last_steps(capacity: int) -> BufferMaker:
 def rows_of(recorded: dict[str, dict[str, np.ndarray]]) -> pd.DataFrame:
     """The valid transitions of all agents as a table.
 
-    Each source has `next_obs [agent, rows, obs_dim]`, and `reward`, `episode` and `valid`,
-    `[agent, rows]`.
+    Each source has `next_obs [agent, rows, obs_dim]`, and `reward` and `valid`, `[agent, rows]`;
+    the tests have the `episode` too.
     """
     tables = []
     for agent in range(recorded["test"]["valid"].shape[0]):
         for source, every in recorded.items():
-            mine = {name: x[agent][every["valid"][agent]] for name, x in every.items()}
-            states = {f"state_{i}": x.astype(float) for i, x in enumerate(mine["next_obs"].T)}
-            columns = {"episode": mine["episode"], "reward": mine["reward"].astype(float)}
+            is_valid = every["valid"][agent]
+            columns = {name: x[agent][is_valid].astype(float) for name, x in every.items()}
+            states = {f"state_{i}": x for i, x in enumerate(columns.pop("next_obs").T)}
             tables.append(pd.DataFrame({"source": source, "agent": agent} | columns | states))
     return pd.concat(tables, ignore_index=True)
 

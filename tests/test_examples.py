@@ -33,7 +33,7 @@ TINY = {
     "reward_network_wrapper": ["--agents=A2C", "--seeds=1", "--max-steps=10", "--test-every=5",
                                "--episodes=1"],
     "rejax_agent": ["--steps=80", "--test-every=40", "--agents=2", "--episodes=2"],
-    "rejax_mujoco": ["--env=reacher", "--steps=32", "--test-every=16", "--rollout=16"],
+    "rejax_mujoco": ["--env=reacher", "--steps=128", "--test-every=64", "--rollout=64"],
 }  # fmt: skip
 PRINTS = {
     "algorithm1": r"^generation 0: new agents return \d+\.\d\n$",
@@ -49,7 +49,7 @@ PRINTS = {
     "cleanrl_dqn": r"return on CartPole-v1 every 30 steps on sejax\.gym:sejax/cartpole: \d+ \d+\n",
     "reward_network_wrapper": r"A2C with the RN: solved after .*median .*\nA2C without it: ",
     "rejax_agent": r"every 40 steps on the SE: \d+ \d+ \d+\n.*on CartPole: \d+ \d+ \d+\n",
-    "rejax_mujoco": r"^score on reacher every 16 steps: -\d+ -\d+ -\d+\n$",
+    "rejax_mujoco": r"^score on reacher every 64 steps: -\d+ -\d+ -\d+\n$",
 }
 # What is not in the development environment; `make test-examples` has it.
 NEEDS = {

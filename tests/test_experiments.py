@@ -14,11 +14,12 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from support import random_like, refuse, refused, shapes_of
+from flax.traverse_util import unflatten_dict
+from support import numpy_forward, random_like, refuse, refused, shapes_of
 
 import experiments
 import sejax
-from experiments import peers, score_transforms
+from experiments import peers
 from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
@@ -48,7 +49,6 @@ TINY = {
     "rn_heatmap": RNS,
     "rn_objectives": f"{CURVES} objectives=[reward_threshold,auc]",
     "rn_performance": CURVES,
-    "score_transforms": "runs=3 generations=2 population=2 transforms=rank",
     "se_distilled": "env=cartpole students=ddqn run.training.max_steps=60 "
     "run.training.max_episodes=60",
     "se_dynamics": "kinds=[bandit,threshold] students=ddqn runs=1 generations=2 num_agents=2 "
@@ -104,14 +104,15 @@ def tiny(monkeypatch):
     """Agents and steps that cost nothing."""
 
     def tiny_agent(kind):
-        return registry.configure("agent", {"name": kind, **TINY_AGENT})
+        known = vars(registry.configure("agent", {"name": kind}))
+        small = {name: value for name, value in TINY_AGENT.items() if name in known}
+        return registry.configure("agent", {"name": kind, **small})
 
     monkeypatch.setattr(agents, "agent_config", tiny_agent)
-    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
 
 
 def refuse_to_compute(monkeypatch):
-    places = {agents: "train", workers.Chunks: "advance", score_transforms: "compute_cell"}
+    places = {agents: "train", workers.Chunks: "advance"}
     for place, name in places.items():
         monkeypatch.setattr(place, name, refuse)
 
@@ -161,20 +162,14 @@ def test_an_experiment_says_what_it_is_and_refuses_other_words(name, tmp_path, c
 
 def test_an_se_of_synthetic_gymnax_as_one_of_sejax_is_the_same(published):
     file, task, key = published / "cartpole.npz", sejax.envs.make("cartpole_v1"), jax.random.key(0)
-    theirs = np.load(file)
-
-    def network(name, x):
-        for layer in (f"params/{name}/Dense_0", f"params/{name}/Dense_1"):
-            x = np.maximum(x, 0) if layer.endswith("1") else x
-            x = x @ theirs[f"{layer}/kernel"] + theirs[f"{layer}/bias"]
-        return x
-
+    theirs = unflatten_dict({name: x.T for name, x in np.load(file).items()}, sep="/")["params"]
     env, weights = peers.converted(file, task)
     obs, state = env.reset_env(key, env.params(weights))
-    noise = jax.random.normal(key, (4,))
-    np.testing.assert_allclose(obs, network("initial_state", noise), atol=1e-5)
     _, _, reward, terminated, _ = env.step_env(key, state, 1, env.params(weights))
-    np.testing.assert_allclose(reward, network("reward", np.array([*obs, 0, 1]))[0], rtol=1e-5)
+    start = numpy_forward(theirs["initial_state"], jax.random.normal(key, (4,)), "relu", 1)
+    np.testing.assert_allclose(obs, start, atol=1e-5)
+    paid = numpy_forward(theirs["reward"], np.array([*obs, 0, 1]), "relu", 1)
+    np.testing.assert_allclose(reward, paid[0], rtol=1e-5)
     assert terminated and refused(peers.converted, published / "acrobot.npz", task) == "theirs"
 
 
