@@ -52,7 +52,7 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     """Agents on a proxy, and on its real task beside them."""
     proxy = _load(config)
     env, task = proxy.env, proxy.task
-    real_training, trainings = _real_training(config, proxy), {}
+    real_training, trainings = config.real_training, {}
     for key, agent in config.agents.items():
         config.require_fit(key, task, task.name)
         group, training = "real_training", real_training
@@ -103,16 +103,3 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
     require("training" in proxy.config, "training_from", message + fix)
     test_episodes = config.real_training.test_episodes
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
-
-
-def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
-    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
-    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
-    if not (as_learned and proxy.env.is_real):
-        return config.real_training
-    is_terminal = training_of(proxy).time_limit_is_terminal
-    default = TrainingConfig().time_limit_is_terminal
-    is_same = config.real_training.time_limit_is_terminal in (default, is_terminal)
-    message = "must be as the proxy's agents learned. Leave it out, or set agent_hparams=default."
-    require(is_same, "real_training.time_limit_is_terminal", message)
-    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
