@@ -13,7 +13,6 @@ It needs `pip install 'sejax[examples]'`.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -103,15 +102,15 @@ class Cell:
             values |= {"discount": 0.9, "entropy_weight": 0.0}
         if self.agent in ("dqn", "ddqn"):
             values |= {"epsilon_min": 0.05, "exploration_steps": self.steps // 10}
-        if action_repeat > 1:
+        else:
             values["action_repeat"] = action_repeat
         return registry.configure("agent", values | {"name": self.agent})
 
     def options(self, names: dict[str, str]) -> dict[str, Any]:
         """The hyperparameters as another library calls them: its own name, or `THEIRS=OURS`."""
-        words = f"{names['all']} {names.get(self.agent, '')}"
-        words += "" if self.agent == "ppo" else names["off_policy"]
-        pairs = [word.partition("=") for word in words.split()]
+        kinds = ("all", self.agent, "all" if self.agent == "ppo" else "off_policy")
+        words = " ".join(names.get(kind, "") for kind in kinds).split()
+        pairs = [word.partition("=") for word in words]
         return {theirs: getattr(self.config, ours or theirs) for theirs, _, ours in pairs}
 
     @property
@@ -127,7 +126,7 @@ def cells_of(library: str, settings: Agents) -> list[Cell]:
         agents, steps, ppo_steps, *_ = TASKS[task]
         in_sb3 = ("dqn", "ppo") if agents == DISCRETE else CONTINUOUS
         known = {"sejax": agents, "sb3": in_sb3}.get(library, ("dqn", "ddqn", "sac"))
-        for agent in (agent for agent in agents if agent in known):
+        for agent in sorted({*agents} & {*known}, key=agents.index):
             usual = ppo_steps if agent == "ppo" else steps
             chosen.append(Cell(task=task, agent=agent, steps=settings.steps or usual))
     return chosen
@@ -153,8 +152,8 @@ def train_sejax(cell: Cell, limit_is_terminal: bool = False) -> Train:
 SB3 = {
     "all": "learning_rate gamma=discount",
     "off_policy": "buffer_size batch_size tau",
-    "dqn": "exploration_final_eps=epsilon_min ",
-    "td3": "policy_delay target_policy_noise=target_noise_std target_noise_clip ",
+    "dqn": "exploration_final_eps=epsilon_min",
+    "td3": "policy_delay target_policy_noise=target_noise_std target_noise_clip",
     "ppo": "n_steps=rollout_steps n_epochs=epochs gae_lambda clip_range=clip_ratio max_grad_norm "
     "ent_coef=entropy_weight vf_coef=value_weight",
 }
@@ -192,13 +191,13 @@ def train_sb3(cell: Cell) -> Train:
     layers = [config.hidden_size] * config.num_layers
     networks: dict[str, Any] = {"net_arch": layers, "activation_fn": activation}
     if cell.agent == "ppo":
-        networks["log_std_init"] = math.log(config.init_action_std)
+        networks["log_std_init"] = np.log(config.init_action_std)
         options["batch_size"] = config.rollout_steps // config.num_minibatches
     else:
         options |= {"learning_starts": TASKS[cell.task][4], "train_freq": 1, "gradient_steps": 1}
     if cell.agent == "dqn":
         options |= {"exploration_fraction": cell.exploration, "target_update_interval": 1}
-        options["max_grad_norm"] = math.inf
+        options["max_grad_norm"] = np.inf
     if cell.agent == "td3":
         std = np.full(cell.real.action_dim, config.action_noise_std)
         options["action_noise"] = NormalActionNoise(0 * std, std)
@@ -207,7 +206,7 @@ def train_sb3(cell: Cell) -> Train:
         make = functools.partial(make_vec_env, lambda: Repeated(cell))
         env: Any = make(seed=seed)
         if cell.agent == "ppo":
-            env = VecNormalize(env, norm_obs=False, clip_reward=math.inf, gamma=config.discount)
+            env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=config.discount)
         algorithm = getattr(sb3, cell.agent.upper())
         model = algorithm("MlpPolicy", env, seed=seed, policy_kwargs=networks, **options)
         model.learn(cell.steps)
@@ -219,8 +218,8 @@ def train_sb3(cell: Cell) -> Train:
 REJAX = {
     "all": "learning_rate gamma=discount",
     "off_policy": "buffer_size batch_size",
-    "dqn": "eps_end=epsilon_min ddqn=double ",
-    "ddqn": "eps_end=epsilon_min ddqn=double ",
+    "dqn": "eps_end=epsilon_min ddqn=double",
+    "ddqn": "eps_end=epsilon_min ddqn=double",
 }
 
 
@@ -335,8 +334,7 @@ def report(settings: Agents, rows: pd.DataFrame) -> pd.DataFrame:
         f"Mean return of {TEST_EPISODES} greedy episodes after the last step (agents); of the "
         "difference Welch's 95% interval over agents."
     )
-    title = "Agents of three libraries with equal settings"
-    return tables.publish(settings, title, table, summary, note)
+    return tables.publish(settings, "Agents of three libraries", table, summary, note)
 
 
 def draw(settings: Agents, rows: pd.DataFrame) -> None:

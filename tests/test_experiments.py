@@ -46,7 +46,6 @@ TINY = {
     "test_episodes=1",
     "null_baselines": "sources=[by_hand,episodes,evolved] students=ddqn hparams=default policies=1 "
     "num_agents=2 num_evolved=2 steps=40 teacher_steps=60 num_states=16",
-    "rn_heatmap": RNS,
     "rn_objectives": f"{CURVES} objectives=[reward_threshold,auc]",
     "rn_performance": CURVES,
     "score_transforms": "runs=3 generations=2 population=2 transforms=rank",
