@@ -5,10 +5,8 @@
 
 The script trains eight agents on Pendulum for 20,000 steps, 20 seconds on four cores:
 
-    test return of each agent: -114 -151 -142 -185 -173 -133 -169 -143
-    mean -151
-
-Of 16 other seeds, 15 returned more than -200 (mean -158), and after 10,000 steps 14 more than -300.
+    test return of each agent: -108 -148 -141 -183 -172 -131 -120 -148
+    mean -144
 
 An agent is a `sejax.Agent`, a bundle of pure functions of one agent's state; the inner loop stores
 its steps and calls `update` on batches of them. The dataclass makes it configurable: its fields are

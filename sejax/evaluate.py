@@ -123,7 +123,7 @@ def setup_of(config: EvaluateConfig) -> Setup:
         proxy, task, real_training = None, envs.make(str(config.env)), config.real_training
     else:
         proxy = _load(config)
-        task, real_training = proxy.task, _real_training(config, proxy)
+        task, real_training = proxy.task, config.real_training
     trainings = {}
     for key, agent in config.agents.items():
         field = compose.field_of(key, config.agents)
@@ -178,19 +178,6 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
     require("training" in proxy.config, "training_from", message + fix)
     test_episodes = config.real_training.test_episodes
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
-
-
-def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
-    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
-    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
-    if not (as_learned and proxy.env.is_real):
-        return config.real_training
-    is_terminal = training_of(proxy).time_limit_is_terminal
-    default = TrainingConfig().time_limit_is_terminal
-    is_same = config.real_training.time_limit_is_terminal in (default, is_terminal)
-    message = "must be as the proxy's agents learned. Leave it out, or set agent_hparams=default."
-    require(is_same, "real_training.time_limit_is_terminal", message)
-    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 
 
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:

@@ -57,7 +57,7 @@ class TrainingConfig(Options):
       test_episodes: n_te: greedy episodes on the real task after training
       tests_between: Greedy episodes on the real task after each training episode; the solved rule
         by tests has at least one.
-      time_limit_is_terminal: a real episode cut by the limit does not bootstrap
+      time_limit_is_terminal: A real episode cut by the limit does not bootstrap, as in the paper.
     """
 
     group: ClassVar[str] = "training"
@@ -71,7 +71,7 @@ class TrainingConfig(Options):
     solved_by: str = option("test", one_of(("test", "train")))
     test_episodes: int = option(10, counts("it counts episodes"))
     tests_between: int = option(0, counts("it counts episodes", least=0))
-    time_limit_is_terminal: bool = True
+    time_limit_is_terminal: bool = False
 
     @property
     def is_fixed_length(self) -> bool:

@@ -33,6 +33,7 @@ def paper_se(**fields):
 def paper_training(**fields):
     """The paper's training, which ends by its returns, but for these fields."""
     paper = {"max_steps": None, "max_episodes": 1000, "stop_rule": "plateau"}
+    paper |= {"time_limit_is_terminal": True}
     return TrainingConfig(**paper | fields)
 
 

@@ -153,11 +153,13 @@ def test_what_cannot_be_trained_is_refused_before_anything_starts(
     assert refused(evaluate, evaluate_config(f"proxy={path}", *words.split())) == field
 
 
-@pytest.mark.parametrize(("word", "expected"), [("agent_hparams=as_learned", False),
-                                               ("agent=td3", True)])  # fmt: skip
+@pytest.mark.parametrize(("word", "expected"), [
+    ("agent_hparams=as_learned", True), ("real_training.time_limit_is_terminal=false", False),
+    ("agent=td3", False),
+])  # fmt: skip
 def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(word, expected, tmp_path):
-    """Pendulum's bootstrap there; on the real task beside the RN they do likewise."""
-    path = save(tmp_path / "proxy.safetensors", "env=pendulum", "proxy=rn")
+    """They do not bootstrap there; on the real task beside the RN they do likewise; words win."""
+    path = save(tmp_path / "proxy.safetensors", "env=mountain_car_continuous", "proxy=rn")
     for world in setup_of(evaluate_config(f"proxy={path}", word)).worlds.values():
         assert world.trainings["td3"].time_limit_is_terminal == expected
 

@@ -7,14 +7,13 @@ import lzma
 import numpy as np
 import pandas as pd
 import pytest
-from test_experiments import CURVES, RNS, fields, refuse_to_compute
+from test_experiments import CURVES, fields, refuse_to_compute
 
 import sejax
-from experiments import rn_heatmap, rn_performance
+from experiments import rn_performance
 from experiments.common import curves, rn_curves, shards
 from experiments.common import reward_networks as rn
 from experiments.common.statistics import mean_interval
-from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_performance import RnPerformance
 from sejax.options import ConfigError
 
@@ -80,25 +79,6 @@ def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monke
     other = dataclasses.replace(settings, run=run, variants=variants)
     with pytest.raises(ConfigError, match=r"another proxy\.hidden_size"):
         rn_performance.EXPERIMENT.run(other)
-
-
-def test_the_heat_map_shows_what_the_rns_pay(options):
-    settings = options(RnHeatmap, RNS)
-    table = rn_heatmap.EXPERIMENT.run(settings)
-    assert list(table["variant"]) == list(settings.variants)
-    summary = pd.read_csv(settings.summary_file).set_index(["variant", "move"])
-    # 11 moves into the cliff cost 100 and only the additive RNs pay the real reward as well.
-    assert summary.loc[("additive_potential", "into the cliff"), "mean"] < -90
-    assert summary.loc[("exclusive_non_potential", "into the cliff"), "mean"] > -10
-
-    rns = rn.learn(settings, "exclusive_non_potential", "reward_threshold")
-    rewards = rn_heatmap.rewards_of_moves(rns)
-    assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
-    potential = [float(rns.env.potential(rns[1].params, np.int32(s))) for s in (24, 0)]
-    # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
-    np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
-    stored = rn_heatmap.by_variant(settings, shards.read_rows(settings.rows_file))
-    np.testing.assert_allclose(stored["exclusive_non_potential"], rewards, rtol=1e-6)
 
 
 def curves_of(world, num_groups, solved_reward=-12.0):

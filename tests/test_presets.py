@@ -59,7 +59,8 @@ def test_classes_have_the_defaults_of_the_command(agent):
     composed = composed_with(f"env={env}", f"agent={agent}")
     assert composed.agent == type(composed.agent)()
     assert composed.proxy == sejax.SyntheticConfig()
-    assert composed.training == sejax.TrainingConfig()
+    # An SE has no real time limit; those that are stored were learned with this value.
+    assert composed.training == sejax.TrainingConfig(time_limit_is_terminal=True)
     assert composed.es == sejax.NESConfig()
 
 

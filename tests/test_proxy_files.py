@@ -72,6 +72,8 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
     assert refused(proxy.learned_with, "agent") == "agent"
     assert refused(sejax.training_of, proxy) == "training"
+    sejax.save(path, env, weights[1], {"training": {"max_steps": 7}}, 0.7)  # without the field
+    assert sejax.training_of(sejax.load_proxy(path)).time_limit_is_terminal
 
 
 def test_a_set_comes_back_and_parts_of_it_are_chosen_by_score_and_place(tmp_path, env, weights):

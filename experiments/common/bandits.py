@@ -165,12 +165,7 @@ def trained(task: Task, config: Any, real_steps: int, seed: int) -> Teacher:
 @functools.cache
 def _trainer(task: Task, agent: sejax.Agent, real_steps: int) -> Callable[..., Any]:
     """A compiled training on the real task."""
-    training = sejax.TrainingConfig(
-        max_steps=real_steps,
-        max_episodes=real_steps,
-        stop_rule="never",
-        time_limit_is_terminal=False,
-    )
+    training = sejax.TrainingConfig(max_steps=real_steps, max_episodes=real_steps)
     train = jax.jit(sejax.make_trainer(agent, task.env, training))
     return train.lower(jax.random.key(0), task.params).compile()
 

@@ -126,9 +126,7 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     """A fresh agent with its default hyperparameters, trained on the real task."""
     with options.errors_of("agent", "policy"):  # it may not fit the task
         agent = make_agent(registry.configure("agent", {"name": name}), task)
-    training = TrainingConfig(
-        max_steps=num_steps, max_episodes=num_steps, time_limit_is_terminal=False
-    )
+    training = TrainingConfig(max_steps=num_steps, max_episodes=num_steps)
     train = make_trainer(agent, task.env, training)
     key_train, key_act = jax.random.split(key)
     print(f"training a {name} on {task.name} for {num_steps:,} steps ...", flush=True)

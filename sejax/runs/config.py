@@ -253,11 +253,11 @@ class EvaluateConfig(CommandConfig):
       agent_hparams: as_learned: agents and exploration that the proxy was learned with, where no
         agent is named; default: the agent's; varied: drawn around them for each agent.
       training_from: How long agents train on the proxy. proxy: on an SE as it was learned with, on
-        a reward network as on the real task (as_learned: with the time limit as in its run);
-        config: as `training` says.
+        a reward network as on the real task; config: as `training` says.
       baseline: as many agents trained on the real task, beside them
       out_dir: null: beside the proxy (runs/evaluate-<name> without a folder)
       real_training: On the real task, and how all agents are tested unless training_from=config.
+        Agents as_learned take its time limit as they did, or on an SE would have.
     """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration",)
@@ -299,7 +299,7 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     """
     # A stored proxy does not say who followed its run, or where it was computed.
     unsaid = {"tracker": {"name": "none"}, "machines": {"name": "local"}}
-    return _from_plain(LearnConfig, unsaid | dict(values), imports)
+    return _from_plain(LearnConfig, merge(unsaid, header.UNSAID, values), imports)
 
 
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
@@ -428,7 +428,8 @@ def words_of(config: CommandConfig) -> dict[str, Any]:
 def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     """What a proxy was learned with, as far as the agents of an evaluation have it.
 
-    Where its words name no agent, they are all of the proxy's, with their exploration; of a file
+    Where its words name no agent, they are all of the proxy's, with their exploration, and take the
+    time limit of the real task as the run says (of an SE, where it is idle, too); of a file
     that does not tell its agents, the default one of its task. An agent that they name has the
     hyperparameters that the proxy was learned with, if it was with such a one.
 
@@ -461,7 +462,10 @@ def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     if stored is None:
         return {}
     if learned and not words and hparams in (None, "as_learned"):
-        return {"agents": learned, "exploration": explored, "agent_hparams": "as_learned"}
+        said = flatten(merge(header.UNSAID, stored.config))
+        limit = {"time_limit_is_terminal": said.get("training.time_limit_is_terminal")}
+        choices = {"agents": learned, "exploration": explored, "real_training": limit}
+        return choices | {"agent_hparams": "as_learned"}
     default = agents.default_for(stored.spec)
     by_name = {x["name"]: x for x in learned.values()} if hparams is None else {}
     names = compose.agents_of(values) or {default: default}
