@@ -55,13 +55,8 @@ def main() -> None:
                 f"{side}_us": common.spread([x["us"] for x in values])
                 for side, values in answers.items()
             }
-            row |= {f"{side}_compile_s": values[0]["compile_s"] for side, values in answers.items()}
-            rows.append(row)
-            print(
-                *(f"{request[name]}" for name in request),
-                *(f"{side} {row[f'{side}_us']['median']:.1f}" for side in SIDES),
-                flush=True,
-            )
+            seconds = {f"{side}_compile_s": x[0]["compile_s"] for side, x in answers.items()}
+            rows.append(row | seconds)
     table = best_of_modes(rows)
     common.print_table(
         "CPU microseconds a step on one core, the better of map and vmap",
