@@ -11,7 +11,7 @@ Writes evaluation.csv, .json and .png into out_dir. --print-config prints the co
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -20,12 +20,13 @@ from rich.console import Console
 from rich.table import Table
 
 from sejax.agents import make_agent
+from sejax.envs import Task
 from sejax.evaluation import evaluate_agents
 from sejax.ops.files import require_writable, write_text
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.config import EvaluateConfig
-from sejax.runs.worlds import Setup, proxy_setup, real_setup
+from sejax.runs.worlds import Setup, World, proxy_setup, real_setup
 
 # Columns of the table: what they show, and with how many digits.
 SHOWN = {
@@ -79,7 +80,11 @@ def evaluate(config: EvaluateConfig) -> float:
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
     summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
-    _print_table(summary, setup, config)
+    (key, *others), task = config.agents, setup.task
+    who = "agents of each kind" if others else f"{key} agents"
+    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
+    title = f"{config.num_agents} fresh {who}, tested on {task.name}{solved}"
+    print_table(summary, title, f"{out_dir}/evaluation.csv, .json and .png hold every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
     title = f"fresh {' + '.join(config.agents)} agents on {setup.task.name}"
@@ -90,23 +95,28 @@ def evaluate(config: EvaluateConfig) -> float:
 
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
     """A row for each agent of a kind."""
-    env, env_params, trainings = setup.worlds[world]
-    is_varied = config.agent_hparams == "varied"
-    agent = make_agent(config.agents[key], setup.task, config.exploration, is_varied)
-    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
     print(f"training {config.num_agents:,} {who} on {world} ...", flush=True)
-    limits = config.num_parallel, config.devices
-    outcome = evaluate_agents(agent, env, env_params, setup.task, trainings[key], keys, *limits)
-    outcome = jax.device_get(outcome)
+    columns = train(config, setup.task, setup.worlds[world], key)
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
+    return pd.DataFrame({**numbers, **columns})
+
+
+def train(config: EvaluateConfig, task: Task, world: World, key: str) -> dict[str, Any]:
+    """What fresh agents of a kind reach in a world, arrays `[agent]` by the table's columns."""
+    env, env_params, trainings = world
+    is_varied = config.agent_hparams == "varied"
+    agent = make_agent(config.agents[key], task, config.exploration, is_varied)
+    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
+    how = trainings[key], keys, config.num_parallel, config.devices
+    outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
-    return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **varied})
+    return {"test_return": outcome.test_return, **of_agents, **varied}
 
 
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -135,25 +145,23 @@ def spread(mean: float, std: float, digits: int) -> str:
     return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
-def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
-    task = setup.task
-    (first, *others) = config.agents
-    who = "agents of each kind" if others else f"{first} agents"
-    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
-    table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
+def print_table(
+    summary: pd.DataFrame, title: str, last: str, shown: Mapping[str, tuple[str, int]] = SHOWN
+) -> None:
+    """Prints what `summarise` returns, a row for each group, and a last line below."""
     labels = ["trained on", "agent"][: summary.index.nlevels]
-    for column in (*labels, *SHOWN):
+    table = Table(title=title)
+    for column in (*labels, *shown):
         table.add_column(column, justify="left" if column in labels else "right")
     for index, row in summary.iterrows():
-        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in SHOWN.values())
+        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in shown.values())
         table.add_row(*([index] if len(labels) == 1 else index), *numbers)
     console = Console(highlight=False)
     console.print(table)
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    files = f"{setup.out_dir}/evaluation.csv, .json and .png"
-    console.print(f"{files} hold every agent.", soft_wrap=True)
+    console.print(last, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -68,9 +68,9 @@ def test_so_they_do_with_the_flags_of_a_command(case):
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):
-    setup = workers.setup_of(sejax.config(SOLVING))
+    versions = runtime.versions()
     monkeypatch.setattr(runtime, "versions", lambda: {"jax": "0.1"})
-    error = refusal(workers.score, setup, (0, ()))
+    error = refusal(workers.call, versions, workers.score, (0, ()))
     assert error.field == "machines" and "0.1" in str(error)
 
 

@@ -101,12 +101,12 @@ def require_fit(
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
-        fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
+        known = fitting(spec)
         require(
             False,
             "agent",
-            f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
-            f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
+            f"must be one of {', '.join(known)} in {task_name}, with {spec.states} states and "
+            f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={known[0]}.",
         )
     exploration_name = shortened(registry.name_of("exploration", exploration))
     require(
@@ -119,8 +119,13 @@ def require_fit(
 
 def default_for(spec: TaskSpec) -> str:
     """The default agent of a task: the first that fits it."""
-    fitting = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
-    return next(fitting, DEFAULTS[0])  # which `require_fit` refuses, if none does
+    known = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
+    return next(known, DEFAULTS[0])  # which `require_fit` refuses, if none does
+
+
+def fitting(spec: TaskSpec) -> list[str]:
+    """Names of the agents that can act in a task."""
+    return [name for name in names() if _fits(registry.find("agent", name), spec)]
 
 
 def _fits(agent: AgentConfig | type[AgentConfig], spec: TaskSpec) -> bool:

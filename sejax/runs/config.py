@@ -376,11 +376,11 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
     return _composed(LearnConfig, overrides)[0]
 
 
-def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
-    """As `config`, for the words after `python -m sejax.evaluate`."""
+def evaluate_config(overrides: Sequence[str] = (), schema: Any = EvaluateConfig) -> Any:
+    """As `config`, for the words after `python -m sejax.evaluate` or, by `schema`, the like."""
     message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
     require("proxy" in read(overrides), "proxy", message)
-    return _composed(EvaluateConfig, overrides)[0]
+    return _composed(schema, overrides)[0]
 
 
 def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, Layers]:

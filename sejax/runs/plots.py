@@ -115,6 +115,34 @@ def evaluation(
         _write(figure, path)
 
 
+def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
+    """Draws what agents reached in each row of a check: a point for each, a bar for their mean.
+
+    Args:
+      table: a data frame with the columns `world`, `agent` and `test_return`.
+      solved_reward: the task's threshold.
+      path: the picture.
+      title: what was checked, and the verdict.
+    """
+    rows, rng = list(table["world"].unique()), np.random.default_rng(0)
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(8, 1.5 + 0.6 * len(rows)))
+        for y, row in enumerate(rows):
+            parts = list(table[table["world"] == row].groupby("agent", sort=False)["test_return"])
+            for i, (name, returns) in enumerate(parts):
+                level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
+                spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
+                color = AGENTS[i % len(AGENTS)]
+                axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
+                axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
+                axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)
+        axis.axvline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+        axis.set_yticks(range(len(rows)), [f"trained on {row}" for row in rows])
+        axis.invert_yaxis()
+        axis.set(xlabel=PANELS["test_return"], title=title)
+        _write(figure, path)
+
+
 def _write(figure: Figure, path: Path) -> None:
     figure.set_layout_engine("constrained")
     with atomic_path(path) as temporary:

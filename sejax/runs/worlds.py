@@ -50,7 +50,7 @@ def real_setup(config: EvaluateConfig) -> Setup:
 
 def proxy_setup(config: EvaluateConfig) -> Setup:
     """Agents on a proxy, and on its real task beside them."""
-    proxy = _load(config)
+    proxy = loaded(config)
     env, task = proxy.env, proxy.task
     real_training, trainings = _real_training(config, proxy), {}
     for key, agent in config.agents.items():
@@ -74,7 +74,7 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     return Setup(task, worlds, folder)
 
 
-def _load(config: EvaluateConfig) -> Proxy:
+def loaded(config: EvaluateConfig) -> Proxy:
     """The proxy; modules are imported if the command line names them, never because a file does.
 
     Raises:
