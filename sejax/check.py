@@ -112,7 +112,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
       **fields: of the command, such as `num_agents=40`.
 
     Returns:
-      What `check.json` holds: `verdict`, `judgements` by agent, `cost`, `null` and `rows`.
+      What `check.json` holds: `verdict`, `judgements` by agent, `null_se`, `cost` and `worlds`.
 
     Raises:
       ConfigError: for a field that cannot be, or a proxy that cannot be judged.
@@ -130,18 +130,18 @@ def run(config: CheckConfig) -> dict[str, Any]:
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
     others, myopic = _others(config, task), dict[str, dict[str, AgentConfig]]()
+    students = learned | others | {"tuned": _tuned(task)}
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
         sighted = {f"{k}-{x:g}": dataclasses.replace(a, discount=x) for k, a in learned.items()}
-        myopic[f"the proxy, discount {x:g}"] = sighted
-    students = learned | others | functools.reduce(dict.__or__, myopic.values(), {})
-    config = dataclasses.replace(config, agents=students | {"tuned": _tuned(task)})
+        myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
+    config = dataclasses.replace(config, agents=students)
     on_proxy, on_task = proxy_setup(config).worlds.values()
     folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
     settings = configuration.plain(config) | {"proxy": proxy.fingerprint, "task": task.origin}
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
     with Store(folder, settings, field="out_dir", free=FREE) as store:
-        null = {}
+        null = dict[str, Any]()
         if not proxy.env.is_real and task.num_states is None:
             world, null = _null(config, task, on_proxy, store)
             rows[NULL] = world, [*learned, *others]
@@ -160,8 +160,7 @@ def _others(config: CheckConfig, task: Task) -> dict[str, AgentConfig]:
     """Agents that the proxy was not learned with, by name, with default hyperparameters."""
     learned = {registry.name_of("agent", agent) for agent in config.agents.values()}
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
-    unseen = [name for name in names if name not in learned]
-    return {name: registry.configure("agent", {"name": name}) for name in unseen}
+    return {x: registry.configure("agent", {"name": x}) for x in names if x not in learned}
 
 
 def _tuned(task: Task) -> AgentConfig:
@@ -193,7 +192,7 @@ def _null(
     env, weights = make_exact(task, lesson.layers, lesson.states)
     limits = {key: x.max_steps or 2000 for key, x in on_proxy.trainings.items()}
     trainings = {key: TrainingConfig(max_steps=x, max_episodes=x) for key, x in limits.items()}
-    about = {"policy": method, "return": lesson.policy_return, "real_steps": int(steps)}
+    about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
     return World(env, env.params(weights), trainings), about
 
 
@@ -238,14 +237,15 @@ def _told(
     if cost:
         saved = min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]
         cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
-    found: dict[str, Any] = {"null": null, "cost": cost, "verdict": verdict_of(judgements.values())}
-    title = f"{proxy.path.stem} of {task.name}, solved at {task.solved_reward:g}"
+    verdict = verdict_of(judgements.values())
+    found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
+    title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
     shown = summary.set_index(solved[summary.index], append=True)
     print_table(shown, title, yaml.safe_dump(found, sort_keys=False).strip(), SHOWN)
     found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
     found["worlds"] = summary.assign(solved=solved).to_dict("index")
     write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")
-    plots.check(table, task.solved_reward, folder / "check.png", f"{title}: {found['verdict']}")
+    plots.check(table, task.solved_reward, folder / "check.png", f"{proxy.path.stem}: {verdict}")
     return found
 
 
