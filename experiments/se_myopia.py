@@ -6,14 +6,7 @@ far-sighted alone teaches through its dynamics.
 
 On each SE, DDQN (TD3 for continuous actions) trains with each discount, with equal seeds, as long
 and with the hyperparameters as it was learned with. R(d) is the return of agents with discount d on
-the real task. The unit of differences is the way from R of untrained agents to the solved return:
-
-- *dynamics*: R(0.99) - R(0) is more than `MARGIN`;
-- *policy*: it is less, and R(0.99) is more than `MARGIN` above R of untrained agents;
-- *teaches little*: R(0.99) is less than that;
-- *open*: the agents do not say.
-
-More and less are those of Student's 95% interval over the agents of an SE, in pairs of equal seeds.
+the real task. Verdicts are those of `sejax.myopia.judge`, as in `python -m sejax.check`.
 """
 
 import dataclasses
@@ -30,9 +23,10 @@ from experiments.common import agents, figures, tables
 from experiments.common.agents import Condition, Group
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
-from experiments.common.statistics import mean_interval, worst_tenth
+from experiments.common.statistics import worst_tenth
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
+from sejax.myopia import MARGIN, judge
 from sejax.options import registry, require
 from sejax.proxies import header
 
@@ -42,7 +36,6 @@ STORED = (  # below results/
 )
 DISCOUNTS = (0.0, 0.5, 0.9, 0.99)
 UNTRAINED = "untrained"
-MARGIN = 0.1  # difference that counts as none, as a share of the way from untrained to solved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,20 +197,12 @@ def verdicts(agents: pd.DataFrame, floor: float, solved_reward: float) -> pd.Dat
       The columns `group`, `loss` (mean difference of returns) with the ends of its interval
       `loss_low` and `loss_high`, and `verdict`.
     """
-    none = MARGIN * (solved_reward - floor)
     found = []
-    for group, mine in agents.groupby("group", sort=False):
-        returns = mine.pivot(index="agent", columns="discount", values="test_return")
-        far, lost = returns.iloc[:, -1], returns.iloc[:, -1] - returns.iloc[:, 0]
-        low, high = mean_interval(lost)
-        gain_low, gain_high = mean_interval(far - floor)
-        if low > none:
-            verdict = "dynamics"
-        elif high < none < gain_low:
-            verdict = "policy"
-        else:
-            verdict = "teaches little" if gain_high < none else "open"
-        columns = {"loss": lost.mean(), "loss_low": low, "loss_high": high, "verdict": verdict}
+    for group, rows in agents.groupby("group", sort=False):
+        returns = rows.pivot(index="agent", columns="discount", values="test_return")
+        judgement = judge(returns.iloc[:, 0], returns.iloc[:, -1], floor, solved_reward)
+        loss, low, high = judgement.loss, judgement.low, judgement.high
+        columns = {"loss": loss, "loss_low": low, "loss_high": high, "verdict": judgement.verdict}
         found.append({"group": group, **columns})
     return pd.DataFrame(found)
 

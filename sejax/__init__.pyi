@@ -22,6 +22,7 @@ from .agents.sac import SACConfig as SACConfig
 from .agents.tabular import QLearningConfig as QLearningConfig, SARSAConfig as SARSAConfig
 from .agents.td3 import DiscreteTD3Config as DiscreteTD3Config, TD3Config as TD3Config
 from .bilevel import LearnResult as LearnResult, make_learner as make_learner
+from .check import check as check
 from .envs.base import Task as Task
 from .es.base import Evaluations as Evaluations, Strategy as Strategy
 from .es.evosax import EvosaxConfig as EvosaxConfig

@@ -9,6 +9,7 @@ from sejax.runs import commands
 COMMANDS = {
     "run": "learn an SE or a reward network for a task: sejax run env=cartpole",
     "evaluate": "train fresh agents on a learned one: sejax evaluate proxy=cartpole",
+    "check": "is a learned one more than a policy: sejax check proxy=cartpole",
     "search": "search hyperparameters: sejax search env=cartpole 'es.noise_std=interval(0.01, 1)'",
     "distill": "make an SE of a policy: sejax distill env=cartpole policy=ppo:FILE.zip",
 }

@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -104,7 +104,11 @@ def evaluate(config: EvaluateConfig) -> float:
     pairs = itertools.product(setup.worlds, config.agents)
     table = pd.concat([_train_and_test(config, setup, *pair) for pair in pairs])
     summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
-    _print_table(summary, setup, config)
+    (key, *others), task = config.agents, setup.task
+    who = "agents of each algorithm" if others else f"{key} agents"
+    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
+    title = f"{config.num_agents} fresh {who}, tested on {task.name}{solved}"
+    print_table(summary, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
     first = table[table["world"] == next(iter(setup.worlds))]
@@ -122,7 +126,7 @@ def setup_of(config: EvaluateConfig) -> Setup:
         require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
         proxy, task, real_training = None, envs.make(str(config.env)), config.real_training
     else:
-        proxy = _load(config)
+        proxy = loaded(config)
         task, real_training = proxy.task, config.real_training
     trainings = {}
     for key, agent in config.agents.items():
@@ -149,7 +153,7 @@ def setup_of(config: EvaluateConfig) -> Setup:
     return Setup(task, worlds, Path(config.out_dir or folder))
 
 
-def _load(config: EvaluateConfig) -> Proxy:
+def loaded(config: EvaluateConfig) -> Proxy:
     """The proxy; modules are imported if the command line names them, never because a file does.
 
     Raises:
@@ -182,24 +186,28 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
 
 def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
     """A row for each agent of an algorithm."""
-    env, env_params, trainings = setup.worlds[world]
-    is_varied = config.agent_hparams == "varied"
-    agent = agents.make_agent(config.agents[key], setup.task, config.exploration, is_varied)
-    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
     print(f"training {config.num_agents:,} {who} on {world} ...", flush=True)
-    limits = config.num_parallel, config.devices
-    outcome = evaluate_agents(agent, env, env_params, setup.task, trainings[key], keys, *limits)
-    outcome = jax.device_get(outcome)
+    columns = train(config, setup.task, setup.worlds[world], key)
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
+    return pd.DataFrame({**numbers, **columns, "world": world})
+
+
+def train(config: EvaluateConfig, task: envs.Task, world: World, key: str) -> dict[str, Any]:
+    """What fresh agents reach in a world, arrays `[agent]` by the table's columns."""
+    env, env_params, trainings = world
+    is_varied = config.agent_hparams == "varied"
+    agent = agents.make_agent(config.agents[key], task, config.exploration, is_varied)
+    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
+    how = trainings[key], keys, config.num_parallel, config.devices
+    outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
-    numbers |= {"test_return": outcome.test_return, **of_agents, **varied, "world": world}
-    return pd.DataFrame(numbers)
+    return {"test_return": outcome.test_return, **of_agents, **varied}
 
 
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -228,24 +236,23 @@ def spread(mean: float, std: float, digits: int) -> str:
     return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
-def _print_table(summary: pd.DataFrame, setup: Setup, config: EvaluateConfig) -> None:
-    task = setup.task
-    (first, *others) = config.agents
-    who = "agents of each algorithm" if others else f"{first} agents"
-    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
-    table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
+def print_table(
+    summary: pd.DataFrame, title: str, last: str, shown: Mapping[str, tuple[str, int]] = SHOWN
+) -> None:
+    """Prints what `summarise` returns, a row for each group, and a last line below."""
     labels = ["trained on", "agent"][: summary.index.nlevels]
-    for column in (*labels, *SHOWN):
+    table = Table(title=title)
+    for column in (*labels, *shown):
         table.add_column(column, justify="left" if column in labels else "right")
     for index, row in summary.iterrows():
-        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in SHOWN.values())
+        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in shown.values())
         table.add_row(*([index] if len(labels) == 1 else index), *numbers)
     console = Console(highlight=False)
     console.print(table)
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    console.print(f"{setup.out_dir}/evaluation.csv holds every agent.", soft_wrap=True)
+    console.print(last, soft_wrap=True)
 
 
 if __name__ == "__main__":

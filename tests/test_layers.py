@@ -11,13 +11,13 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # stand for: they do not count.
 LAYERS = [
     {"__main__"},
-    {"search"},
+    {"search", "check"},
     {"run", "evaluate", "distill"},
     {"searching", "distillation"},
     {"runs"},
     {"bilevel"},
     {"generation"},
-    {"evaluation", "scoring"},
+    {"evaluation", "scoring", "myopia"},
     {"gym"},
     {"proxies.io", "proxies.zoo", "proxies.exact"},
     {"proxies.header"},

@@ -77,9 +77,9 @@ def test_a_worker_imports_the_plugins_that_were_typed():
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):
-    setup = workers.setup_of(sejax.config(SOLVING))
+    versions = runtime.versions()
     monkeypatch.setattr(runtime, "versions", lambda: {"jax": "0.1"})
-    error = refusal(workers.score, setup, (0, ()))
+    error = refusal(workers.call, versions, workers.score, (0, ()))
     assert error.field == "machines" and "0.1" in str(error)
 
 

@@ -14,21 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-LEVEL = 0.95
-LEAST = 5  # independent values of an interval: the range of two holds the median half of the time
-NONE = (float("nan"), float("nan"))  # of fewer
-
-
-def mean_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
-    """Student's confidence interval of the mean of independent values `[n]`; `NONE` if n < `LEAST`.
-
-    Average what belongs together before, such as the agents that one proxy trained.
-    """
-    values = np.asarray(values, float)
-    if values.size < LEAST:
-        return NONE
-    half = student.ppf((1 + level) / 2, values.size - 1) * values.std(ddof=1) / values.size**0.5
-    return float(values.mean() - half), float(values.mean() + half)
+from sejax.myopia import LEAST, LEVEL, NONE
+from sejax.myopia import mean_interval as mean_interval
 
 
 def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[float, float]:

@@ -105,12 +105,12 @@ def require_fit(
       ConfigError: if it cannot.
     """
     if not _fits(agent, spec):
-        fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
-        must = f"{field} must be one of {', '.join(fitting)} in {task_name}, with {spec.states} "
+        known = fitting(spec)
+        must = f"{field} must be one of {', '.join(known)} in {task_name}, with {spec.states} "
         must += (
             f"states and {spec.actions} actions; got {shortened(registry.name_of('agent', agent))}"
         )
-        raise ConfigError(f"{must}. Set agent={fitting[0]}.", field)
+        raise ConfigError(f"{must}. Set agent={known[0]}.", field)
     if exploration.states is not None and agent.states not in (None, exploration.states):
         agent_name = shortened(registry.name_of("agent", agent))
         exploration_name = shortened(registry.name_of("exploration", exploration))
@@ -120,8 +120,13 @@ def require_fit(
 
 def default_for(spec: TaskSpec) -> str:
     """The default agent of a task: the first that fits it."""
-    fitting = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
-    return next(fitting, DEFAULTS[0])  # which `require_fit` refuses, if none does
+    known = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
+    return next(known, DEFAULTS[0])  # which `require_fit` refuses, if none does
+
+
+def fitting(spec: TaskSpec) -> list[str]:
+    """Names of the agents that can act in a task."""
+    return [name for name in names() if _fits(registry.find("agent", name), spec)]
 
 
 def _fits(agent: AgentConfig | type[AgentConfig], spec: TaskSpec) -> bool:

@@ -58,6 +58,7 @@ class SearchConfig(Options):
       alive_bonus: Subtracted from each step's reward while searching; unless given, the task's
         reward for being healthy.
       num_tests: episodes without the error
+      until_solved: Whether the search ends as soon as a tested policy solves the task.
     """
 
     group: ClassVar[str] = "search"
@@ -74,6 +75,7 @@ class SearchConfig(Options):
     alive_bonus: float = option(0.0, finite("it is a reward"))
     num_tests: int = option(5, counts("a policy must be tested"))
     test_every: int = option(10, counts("it counts generations"))
+    until_solved: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -300,6 +302,8 @@ def searched(
     def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
         """The policy of a start after the blocks of generations that begin with these."""
         for first in firsts:
+            if options.until_solved and rows and _test_mean(rows[-1]) >= task.solved_reward:
+                break
             compute = functools.partial(climb, start, first, policy)
             rows.append(store.once(f"search/start{start}-{first}", compute))
             policy = _policy_of(rows[-1])

@@ -76,6 +76,15 @@ class CommandConfig(Options):
       num_parallel: Agents that train side by side on one device, on a CPU no more than are fastest;
         null: what suits the agent and the device.
       devices: null: all
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for group in ("tracker", "machines"):
+            package = getattr(getattr(self, group, None), "package", None)
+            if package is not None and importlib.util.find_spec(package) is None:
+                must = f"{group} must be installed; got {self.name(group)} without the package"
+                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
+                raise ConfigError(f"{must} {package}. {fix}.", group)
     """
 
     groups: ClassVar[tuple[str, ...]] = ()
@@ -184,12 +193,6 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for group in ("tracker", "machines"):
-            package = getattr(getattr(self, group), "package", None)
-            if package is not None and importlib.util.find_spec(package) is None:
-                must = f"{group} must be installed; got {self.name(group)} without the package"
-                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
-                raise ConfigError(f"{must} {package}. {fix}.", group)
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
@@ -368,9 +371,9 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
     return _composed(LearnConfig, overrides)[0]
 
 
-def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
-    """As `config`, for the words after `python -m sejax.evaluate`."""
-    return _composed(EvaluateConfig, overrides)[0]
+def evaluate_config(overrides: Sequence[str] = (), schema: Any = EvaluateConfig) -> Any:
+    """As `config`, for the words after `python -m sejax.evaluate` or, by `schema`, the like."""
+    return _composed(schema, overrides)[0]
 
 
 def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, compose.Layers]:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
+AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
@@ -59,6 +60,34 @@ def learning_curve(
             bottom.plot(x, steps["train_steps_mean"], color=STEPS, lw=1.8)
             bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
         bottom.locator_params(axis="x", integer=True)
+        _write(figure, path)
+
+
+def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
+    """Draws what agents reached in each row of a check: a point for each, a bar for their mean.
+
+    Args:
+      table: a data frame with the columns `world`, `agent` and `test_return`.
+      solved_reward: the task's threshold.
+      path: the picture.
+      title: what was checked, and the verdict.
+    """
+    rows, rng = list(table["world"].unique()), np.random.default_rng(0)
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(8, 1.5 + 0.6 * len(rows)))
+        for y, row in enumerate(rows):
+            parts = list(table[table["world"] == row].groupby("agent", sort=False)["test_return"])
+            for i, (name, returns) in enumerate(parts):
+                level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
+                spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
+                color = AGENTS[i % len(AGENTS)]
+                axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
+                axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
+                axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)
+        axis.axvline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+        axis.set_yticks(range(len(rows)), [f"trained on {row}" for row in rows])
+        axis.invert_yaxis()
+        axis.set(xlabel="return on the real task", title=title)
         _write(figure, path)
 
 

@@ -10,6 +10,7 @@ free, also on machines that join, and sends a share again whose worker died.
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import socket
@@ -36,6 +37,7 @@ from sejax.scoring import GenerationInfo
 
 Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
 BATCH = 16  # trainings in a share whose size nothing says
+Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
 RETRIES = 20  # by Ray, of a share whose worker dies
 LOOK_S = 1.0  # between looks whether the cluster is there
 
@@ -98,6 +100,10 @@ class LocalConfig(Options):
         """The compiled generations of a run."""
         return contextlib.nullcontext(make_chunks(config))
 
+    def pool(self) -> contextlib.AbstractContextManager[Pool]:
+        """Calls a function with each of several tuples of arguments, one after the other."""
+        return contextlib.nullcontext(itertools.starmap)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RayConfig(Options):
@@ -123,6 +129,17 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
+        setup = setup_of(config)
+        with self.pool() as pool:
+            yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
+
+    @contextlib.contextmanager
+    def pool(self) -> Iterator[Pool]:
+        """Calls a function on workers with each of several tuples of arguments.
+
+        Raises:
+          ConfigError: if the cluster cannot be reached.
+        """
         import ray  # of an extra
 
         _use_one_core()
@@ -138,7 +155,7 @@ class RayConfig(Options):
             message = f"{must}; got {self.address} ({told(error)}). {fix}"
             raise ConfigError(message, "machines.address") from error
         try:
-            yield RemoteChunks(config, functools.partial(_on_cluster, self, setup_of(config)))
+            yield functools.partial(_on_cluster, self)
         finally:
             ray.shutdown()
 
@@ -261,30 +278,30 @@ def num_workers(machines: RayConfig) -> int:
 
 
 def _on_cluster(
-    machines: RayConfig, setup: str, shares: Sequence[Portion]
-) -> list[tuple[Outcome, float]]:
-    """What `score` returns for each share, as many at a time as there are workers.
+    machines: RayConfig, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]
+) -> list[Any]:
+    """What a function returns for each tuple of arguments, as many at a time as there are workers.
 
     Raises:
       FailedError: if a worker raises an error or dies again and again, or the cluster is lost.
     """
     import ray  # of an extra
 
-    task = ray.remote(num_cpus=1, max_retries=RETRIES)(score)
-    most, tasks, running = num_workers(machines), [], []
-    for i, share in enumerate(shares, 1):
-        tasks.append(task.remote(setup, share))
+    task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
+    most, versions, tasks, running = num_workers(machines), runtime.versions(), [], []
+    for i, item in enumerate(items, 1):
+        tasks.append(task.remote(versions, function, item))
         running.append(tasks[-1])
-        while len(running) >= (most if i < len(shares) else 1):
+        while len(running) >= (most if i < len(items) else 1):
             done, running = ray.wait(running, timeout=LOOK_S)
             if not done:
                 num_workers(machines)  # which raises if there is no cluster any more
     try:
-        results: list[tuple[Outcome, float]] = ray.get(tasks)
+        results: list[Any] = ray.get(tasks)
     except ray.exceptions.RayError as error:  # its last line is what the worker raised
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
         raise FailedError(
-            f"A worker has failed: {reason}. The generations before are saved; the same command "
+            f"A worker has failed: {reason}. What was finished before is saved; the same command "
             f"with machines=local resumes here."
         ) from error
     return results
@@ -298,15 +315,11 @@ def setup_of(config: LearnConfig) -> str:
     plain = config.plain()
     # A worker need not have what it has no use for.
     needed = {name: x for name, x in plain.items() if name not in ("tracker", "machines")}
-    return json.dumps([needed, runtime.versions()])
+    return json.dumps(needed)
 
 
 def score(setup: str, share: Portion) -> tuple[Outcome, float]:
-    """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took.
-
-    Raises:
-      ConfigError: if this machine has other versions of what decides the numbers.
-    """
+    """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
     (agent_index, trainings), started = share, time.process_time()
     size, program = _programs(setup)[agent_index]
     # Filled up with copies, for which nothing is computed.
@@ -320,15 +333,8 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
 @functools.lru_cache(maxsize=1)
 def _programs(setup: str) -> list[tuple[int, Any]]:
     """The size of a share, and the program that computes one, for each agent of a run."""
-    plain, expected = json.loads(setup)
-    _use_one_core()
-    if (versions := runtime.versions()) != expected:
-        got = f"{versions} on {socket.gethostname()} and {expected} here"
-        must = f"machines must have the same versions everywhere; got {got}"
-        raise ConfigError(f"{must}. Set the same versions up there.", "machines")
-    runtime.configure_jax()
     # Who started the run has typed the names of its plugins.
-    config = configuration.learn_config(plain, imports=None)
+    config = configuration.learn_config(json.loads(setup), imports=None)
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
     def program_of(agent_index: int, size: int) -> Any:
@@ -343,6 +349,21 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 
     sizes = share_sizes(bilevel, config.num_parallel)
     return [(size, program_of(i, size)) for i, size in enumerate(sizes)]
+
+
+def call(versions: dict[str, str], function: Callable[..., Any], item: tuple[Any, ...]) -> Any:
+    """What a function returns on a worker for a tuple of arguments.
+
+    Raises:
+      ConfigError: if this machine has other versions of what decides the numbers.
+    """
+    _use_one_core()
+    if (here := runtime.versions()) != versions:
+        got = f"{here} on {socket.gethostname()} and {versions} here"
+        must = f"machines must have the same versions everywhere; got {got}"
+        raise ConfigError(f"{must}. Set the same versions up there.", "machines")
+    runtime.configure_jax()
+    return function(*item)
 
 
 def _use_one_core() -> None:

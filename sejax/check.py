@@ -1,0 +1,258 @@
+"""Is a learned environment more than a policy? Four comparisons, and a verdict.
+
+  python -m sejax.check proxy=RUN_DIR
+  python -m sejax.check proxy=cartpole num_agents=40 algorithms=[sac]
+
+- Myopia: the agents that it was learned with, with lower discounts (not in episodes of one step,
+  where a discount has no effect).
+- Algorithms: agents that it was not learned with.
+- Null baseline: of an SE, a policy that costs little, written down as a one-step SE for the same
+  agents; of a reward network (RN), the same agents without it, and tuned ones.
+- Cost: agents until it has repaid the real steps of learning it.
+
+Writes check.json and check.png into out_dir. The same command resumes where it stopped.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
+
+import jax
+import pandas as pd
+import yaml
+
+from sejax import agents
+from sejax.agents.base import AgentConfig
+from sejax.distillation.policies import CopyConfig, copied
+from sejax.distillation.policy_search import SearchConfig, searched
+from sejax.distillation.teaching import counted
+from sejax.envs.base import Task
+from sejax.evaluate import World, loaded, print_table, setup_of, summarise, train
+from sejax.myopia import LEAST, judge, verdict_of
+from sejax.ops.files import as_file_name, write_text
+from sejax.options import as_text, counts, one_of, option, registry, require
+from sejax.proxies import header, zoo
+from sejax.proxies.exact import make_exact
+from sejax.proxies.io import Proxy
+from sejax.runs import commands, compose, plots, runtime
+from sejax.runs import config as configuration
+from sejax.runs.config import REAL_TRAINING, EvaluateConfig
+from sejax.runs.store import Store
+from sejax.training import TrainingConfig
+
+DISCOUNTS = (0.0, 0.5, 0.9)  # beside the agents' own
+FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, what is often fastest on the task
+ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
+ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
+FREE = {"devices", "machines", "out_dir", "num_agents"}  # when the command is repeated
+# Rows of the table.
+MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
+NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
+SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
+Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckConfig(EvaluateConfig):
+    """What `sejax.check` takes.
+
+    Attributes:
+      machines: where agents train
+      algorithms: Agents that it was not learned with, with default hyperparameters; null: all that
+        fit the task.
+      null_steps: real steps of finding a policy, at most, by a random search and, if that does not
+        solve the task, by a PPO
+    """
+
+    groups: ClassVar[tuple[str, ...]] = ("exploration", "machines")
+
+    machines: Any
+    algorithms: tuple[str, ...] | None = None
+    null_steps: int = option(200_000, counts("a policy must be found"))
+    num_agents: int = option(20, counts("an interval needs five", LEAST))
+    agent_hparams: str = option("default", one_of(("default", "as_learned")))
+    real_training: TrainingConfig = dataclasses.replace(REAL_TRAINING, max_steps=20_000)
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def main(overrides: Sequence[str]) -> None:
+    """Checks a proxy as the overrides say.
+
+    Raises:
+      ConfigError: for overrides that cannot be, or a proxy that cannot be judged.
+      OSError: if a file cannot be written.
+    """
+    runtime.configure_jax()
+    run(configuration.evaluate_config(overrides, CheckConfig))
+
+
+def help_text(overrides: Sequence[str]) -> str:
+    """What `--help` prints."""
+    return f"{__doc__}\n{configuration.help_text(CheckConfig, overrides)}"
+
+
+def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
+    """Tells whether a learned environment is more than a policy, as `python -m sejax.check`.
+
+    Args:
+      proxy: a run directory, a file, or a shipped name.
+      **fields: of the command, such as `num_agents=40`.
+
+    Returns:
+      What `check.json` holds: `verdict`, `judgements` by agent, `null_se`, `cost` and `worlds`.
+
+    Raises:
+      ConfigError: for a field that cannot be, or a proxy that cannot be judged.
+    """
+    words = [f"{name}={as_text(value)}" for name, value in {"proxy": proxy, **fields}.items()]
+    return run(configuration.evaluate_config(words, CheckConfig))
+
+
+def run(config: CheckConfig) -> dict[str, Any]:
+    """Trains the agents that are missing, and says what was found; see `check`."""
+    proxy, learned = loaded(config), config.agents
+    task = proxy.task
+    jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # or it says why it cannot
+    require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
+    see = all(hasattr(agent, "discount") for agent in learned.values())
+    require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
+    others, myopic = _others(config, task), dict[str, dict[str, AgentConfig]]()
+    students = learned | others | {"tuned": _tuned(task)}
+    for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
+        sighted = {
+            f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
+        }
+        myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
+    config = dataclasses.replace(config, agents=students, baseline=True)
+    on_proxy, on_task = setup_of(config).worlds.values()
+    folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
+    settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
+    rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
+    rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
+    with Store(folder, settings, field="out_dir", free=FREE) as store:
+        null = dict[str, Any]()
+        if not proxy.env.is_real and task.num_states is None:
+            world, null = _null(config, task, on_proxy, store)
+            rows[NULL] = world, [*learned, *others]
+        rows[TASK] = on_task, [*learned][: None if proxy.env.is_real else 1]
+        untrained = dict.fromkeys(learned, TrainingConfig(max_steps=1, max_episodes=1))
+        rows[TUNED] = on_task, ["tuned"]
+        rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
+        table = _trained(config, task, rows, store)
+        return _told(proxy, null, [*learned], table, folder)
+
+
+# --- who trains where -----------------------------------------------------------------------------
+
+
+def _others(config: CheckConfig, task: Task) -> dict[str, AgentConfig]:
+    """Agents that the proxy was not learned with, by name, with default hyperparameters."""
+    learned = {registry.name_of("agent", agent) for agent in config.agents.values()}
+    names = agents.fitting(task) if config.algorithms is None else config.algorithms
+    return {x: registry.configure("agent", {"name": x}) for x in names if x not in learned}
+
+
+def _tuned(task: Task) -> AgentConfig:
+    """An agent with the settings of `preset=best`, but for random episodes that help on SEs."""
+    name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
+    beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
+    fields = beside.get("agent", {}) | {"name": name, "warmup_episodes": 1}
+    return registry.configure("agent", fields)
+
+
+def _null(
+    config: CheckConfig, task: Task, on_proxy: World, store: Store
+) -> tuple[World, dict[str, Any]]:
+    """A policy that costs little as a one-step SE, on which agents train as long as on the proxy.
+
+    A random search finds it or, if that does not solve the task, maybe a PPO.
+    """
+    uses = ("search", "test", "record")
+    keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), 3), strict=True))
+    # A generation has 2 * 16 + 1 episodes and 10 tests.
+    generations = max(1, config.null_steps // (43 * task.max_steps))
+    search = SearchConfig(**ARS, generations=generations, until_solved=True)
+    (lesson,), costs = searched(search, task, 1, keys, store, config.devices)
+    method, steps = "a random search", costs["real_steps"].sum()
+    if lesson.policy_return < task.solved_reward:
+        (other,), costs = copied(CopyConfig(agent_steps=config.null_steps), task, "ppo", keys)
+        steps += costs["real_steps"].sum()
+        method, lesson = max(((method, lesson), ("a PPO", other)), key=lambda x: x[1].policy_return)
+    env, weights = make_exact(task, lesson.layers, lesson.states)
+    limits = {key: x.max_steps or 2000 for key, x in on_proxy.trainings.items()}
+    trainings = {key: TrainingConfig(max_steps=x, max_episodes=x) for key, x in limits.items()}
+    about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
+    return World(env, env.params(weights), trainings), about
+
+
+def _trained(config: CheckConfig, task: Task, rows: Rows, store: Store) -> pd.DataFrame:
+    """A line for each agent; what is missing is computed, a row at a time, and kept."""
+    tables = []
+    with config.machines.pool() as pool:
+        for row, (world, keys) in rows.items():
+            names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
+            missing = [key for key, name in names.items() if store.get(name) is None]
+            print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
+            results = iter(pool(train, [(config, task, world, key) for key in missing]))
+            for key, name in names.items():
+                columns = store.once(name, functools.partial(next, results))
+                tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
+    return pd.concat(tables, ignore_index=True)
+
+
+# --- what was found -------------------------------------------------------------------------------
+
+
+def _told(
+    proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
+) -> dict[str, Any]:
+    """Prints and writes what agents tell: of an SE by returns, of an RN by training steps."""
+    task, is_rn, is_lost = proxy.task, proxy.env.is_real, table["nonfinite"] > 0
+    table["test_return"] = counted(table["test_return"].mask(is_lost))
+    table["train_steps"] = table["train_steps"].mask(is_lost, table["train_steps"].max())
+    table["score"] = -table["train_steps"] if is_rn else table["test_return"]
+    table["solved"] = table["test_return"] >= task.solved_reward
+    by_agent = table.groupby(["world", "agent"], sort=False)
+    scores = {name: score.to_numpy() for name, score in by_agent["score"]}
+    judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
+    for key in learned:
+        floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
+        myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
+        judgements[key] = judge(myopic, scores[OWN, key], floor, top)
+    shares = by_agent["solved"].mean().map("{:.0%}".format).reset_index("agent")
+    solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
+    summary = summarise(table, ["world"])
+    steps, cost = summary["train_steps_mean"], _cost(proxy.path)
+    if cost:
+        saved = min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]
+        cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
+    verdict = verdict_of(judgements.values())
+    found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
+    title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
+    shown = summary.set_index(solved[summary.index], append=True)
+    print_table(shown, title, yaml.safe_dump(found, sort_keys=False).strip(), SHOWN)
+    found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
+    found["worlds"] = summary.assign(solved=solved).to_dict("index")
+    write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")
+    plots.check(table, task.solved_reward, folder / "check.png", f"{proxy.path.stem}: {verdict}")
+    return found
+
+
+def _cost(path: Path) -> dict[str, Any]:
+    """Real steps and CPU seconds of learning, of the file or of `run.json` beside it."""
+    learning = zoo.describe(header.read(path)).learning
+    summary: dict[str, Any] = vars(learning) if learning else {}
+    with contextlib.suppress(OSError, ValueError):
+        summary = summary or json.loads(path.with_name("run.json").read_text())
+    return {name: summary[name] for name in ("real_steps", "cpu_s") if name in summary}
+
+
+if __name__ == "__main__":
+    commands.start(main, help_text)
