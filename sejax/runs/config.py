@@ -76,15 +76,6 @@ class CommandConfig(Options):
       num_parallel: Agents that train side by side on one device, on a CPU no more than are fastest;
         null: what suits the agent and the device.
       devices: null: all
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for group in ("tracker", "machines"):
-            package = getattr(getattr(self, group, None), "package", None)
-            if package is not None and importlib.util.find_spec(package) is None:
-                must = f"{group} must be installed; got {self.name(group)} without the package"
-                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
-                raise ConfigError(f"{must} {package}. {fix}.", group)
     """
 
     groups: ClassVar[tuple[str, ...]] = ()
@@ -96,6 +87,15 @@ class CommandConfig(Options):
     seed: int = option(0, seed())
     num_parallel: int | None = option(None, counts("something must compute"))
     devices: int | None = option(None, counts("something must compute"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for group in ("tracker", "machines"):
+            package = getattr(getattr(self, group, None), "package", None)
+            if package is not None and importlib.util.find_spec(package) is None:
+                must = f"{group} must be installed; got {self.name(group)} without the package"
+                fix = f"Install it with pip install 'sejax[{self.name(group)}]'"
+                raise ConfigError(f"{must} {package}. {fix}.", group)
 
     @property
     def agent(self) -> Any:
