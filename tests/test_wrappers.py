@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
-from support import assert_equal, paper_training
+from support import paper_training
 
 from sejax import envs
 from sejax.envs.wrappers import repeat_actions
@@ -42,16 +42,6 @@ def test_nothing_happens_after_an_episode_has_terminated():
     _, end, reward, terminated, info = env.step_env(KEY, state, jnp.ones(1), task.params)
     assert terminated and info["num_steps"] == 1 and reward == pytest.approx(100 - 0.1)
     assert end.position == pytest.approx(0.449 + 0.05, abs=3e-3)  # one step further, not four
-
-
-@pytest.mark.parametrize("limit", [1, 10])
-def test_an_environment_with_one_done_is_the_same_but_for_the_ends_of_its_step(limit):
-    task = envs.make("cartpole")
-    env, params = envs.with_one_done(task.env), task.params.replace(max_steps_in_episode=limit)
-    _, state = env.reset(KEY, params)
-    *same, terminated, truncated, info = task.env.step(KEY, state, 1, params)
-    assert_equal(jax.jit(env.step)(KEY, state, 1, params), (*same, terminated | truncated, info))
-    assert truncated == (limit == 1) and env.num_actions == 2
 
 
 def test_a_trainer_counts_steps_of_the_world():
