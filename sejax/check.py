@@ -117,7 +117,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
 def run(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents that are missing, and says what was found; see `check`."""
-    proxy, learned = loaded(config), config.agents
+    proxy, learned = loaded(config), dict[str, Any](config.agents)
     task = proxy.task
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # or it says why it cannot
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")

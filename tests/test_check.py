@@ -84,7 +84,7 @@ def test_a_policy_that_is_written_down_is_a_stored_policy(tmp_path, capsys):
     assert found["verdict"] == "a stored policy" and found["judgements"]["ddqn"]["loss"] == 0
     assert found["worlds"]["the proxy"]["test_return_mean"] > 195
     assert found["null_se"]["return"] >= 195 and found["null_se"]["real_steps"] < 200_000
-    assert found["worlds"]["the null SE"]["solved"] == "ddqn 100%" and not found["cost"]
+    assert found["worlds"]["the null SE"]["test_return_mean"] > 150 and not found["cost"]
     assert "verdict: a stored policy\n" in capsys.readouterr().out
 
 
