@@ -7,7 +7,7 @@ imported when its spaces are asked for.
 """
 
 import dataclasses
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
