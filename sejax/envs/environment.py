@@ -130,6 +130,12 @@ class Environment(Generic[State, Params]):
         return type(self).__name__
 
 
+def _gymnax_class() -> Any:
+    from gymnax.environments.environment import Environment as GymnaxEnvironment
+
+    return GymnaxEnvironment
+
+
 def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space, Space]:
     """Spaces of the observations and actions of any gymnax environment, boxes flattened.
 
