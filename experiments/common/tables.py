@@ -56,10 +56,10 @@ def known_text(value: float, form: str) -> str:
 
 
 def steps_text(steps: float) -> str:
-    """A number of steps as tables have it, in millions if there are as many; - if not known."""
-    if steps < 1e6:
+    """A number of steps as tables have it, in millions if there are many; - if not known."""
+    if steps < 1e5:
         return f"{steps:,.0f}"
-    return f"{steps / 1e6:.1f} million" if np.isfinite(steps) else "-"
+    return f"{steps / 1e6:.1f}M" if np.isfinite(steps) else "-"
 
 
 def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
