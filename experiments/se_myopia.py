@@ -259,7 +259,7 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(unstack(rows, "ses"), unstack(rows, "agents"), task.solved_reward)
     draw(settings, summary)
     shown: dict[str, Any] = {
-        "SEs": "{set}",
+        "SEs": lambda row: name_of(row.set),
         "number": "{num_ses}",
         "horizon": "{horizon:.0f} ({at_limit})",
         "terminations": "{done}",
@@ -288,6 +288,11 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, table, summary, note)
 
 
+def name_of(ses: str) -> str:
+    """A set of SEs as people write it."""
+    return NAMES.get(ses.rpartition("/")[2].partition("-")[2], ses)
+
+
 def column(discount: float) -> str:
     """Name of the columns about agents with this discount."""
     return f"return_{discount:g}".replace(".", "_")
@@ -305,14 +310,21 @@ def draw(settings: SeMyopia, summary: pd.DataFrame) -> None:
     with figures.panels(settings.folder / "myopia.png", 1, 1, (7.6, 3.8)) as (figure, [[axes]]):
         for row in summary.to_dict("records"):
             means = [row[f"{column(discount)}_mean"] for discount in DISCOUNTS]
-            label = row["set"].removeprefix("se_feasibility/")
-            axes.plot(range(len(DISCOUNTS)), means, "o-", ms=4, lw=1.4, label=label)
+            axes.plot(range(len(DISCOUNTS)), means, "o-", ms=4, lw=1.4, label=name_of(row["set"]))
         figures.threshold(axes, task.solved_reward, f"solved ({task.solved_reward:g})")
         axes.set_xticks(range(len(DISCOUNTS)), [f"{x:g}" for x in DISCOUNTS])
         axes.set(xlabel="discount of the agents", ylabel=f"mean return on {task.name}")
         figure.legend(loc="outside right center", fontsize=8)
 
 
+NAMES = {  # of sets, by the folders of se_feasibility
+    "fixed": "preset=soft",
+    "varied": "preset=soft, random hyperparameters",
+    "one-step": "one step",
+    "one-step-varied": "one step, random hyperparameters",
+    "paper": "preset=paper",
+    "performance": "preset=paper_performance",
+}
 KINDS = ("policy", "dynamics", "open", "teaches little")  # of verdicts
 EXPERIMENT = Experiment(settings=SeMyopia, compute=compute, report=report, about=__doc__)
 
