@@ -91,7 +91,7 @@ class CommandConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         for group in ("tracker", "machines"):
-            plugin = getattr(self, group, None)
+            plugin: Any = getattr(self, group, None)
             package = getattr(plugin, "package", None)
             if package is not None and importlib.util.find_spec(package) is None:
                 name = registry.name_of(group, plugin)
