@@ -221,17 +221,17 @@ def _told(
     table["solved"] = table["test_return"] >= task.solved_reward
     by_agent = table.groupby(["world", "agent"], sort=False)
     scores = {name: score.to_numpy() for name, score in by_agent["score"]}
-    judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
+    judgements, goal = {}, float(task.solved_reward)
     for key in learned:
         floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
         myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
-        judgements[key] = judge(myopic, scores[OWN, key], floor, top)
+        judgements[key] = judge(myopic, scores[OWN, key], floor, 0.0 if is_rn else goal)
     shares = by_agent["solved"].mean().map("{:.0%}".format).reset_index("agent")
     solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     summary = summarise(table, ["world"])
-    steps, cost = summary["train_steps_mean"], _cost(proxy.path)
-    if cost:
-        saved = min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]
+    steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
+    if cost := _cost(proxy.path):  # never, where its agents do not reach the solved score
+        saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())
     found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}

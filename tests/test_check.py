@@ -98,7 +98,7 @@ def test_a_check_has_a_row_for_each_comparison_and_writes_what_it_returns(whole,
     assert shares[:5] == [*(f"q_learning-{x:g}" for x in (0, 0.5, 0.9)), "q_learning", "sarsa"]
     steps = [found["worlds"][name]["train_steps_mean"] for name in names]
     assert steps[:5] == [50] * 5 and steps[-1] == 1
-    assert found["cost"]["agents_to_break_even"] == round(1000 / min(steps[5:7]))
+    assert found["cost"]["agents_to_break_even"] == "never"  # its agents do not solve the task
     assert json.loads((folder / "check/check.json").read_text()) == found
     assert is_drawn(folder / "check/check.png")
     assert run(folder / "mine.safetensors", out_dir=folder / "check") == found  # trains nobody
