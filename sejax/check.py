@@ -120,6 +120,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
     proxy, learned = loaded(config), dict[str, Any](config.agents)
     task = proxy.task
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # or it says why it cannot
+    require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
@@ -130,7 +131,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
             f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
         }
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
-    config = dataclasses.replace(config, agents=students, baseline=True)
+    config = dataclasses.replace(config, agents=students)
     on_proxy, on_task = setup_of(config).worlds.values()
     folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
     settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
