@@ -1,5 +1,7 @@
 """sejax.agents.exploration: the bonus by a plain loop, and in a training."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from test_tabular import step, trained
 
 from sejax import envs
-from sejax.agents.exploration import CountBasedConfig, with_count_bonus
+from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, Tabular
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
@@ -17,7 +19,7 @@ PLAIN = Tabular(QLearningConfig(learning_rate=0.5), NUM_STATES, NUM_ACTIONS).age
 
 def counting(plain=PLAIN, power=1.0, num_states=NUM_STATES, num_actions=NUM_ACTIONS):
     config = CountBasedConfig(reward_scale=BETA, count_power=power)
-    return with_count_bonus(plain, config, num_states, num_actions)
+    return config.make(plain, SimpleNamespace(num_states=num_states, num_actions=num_actions))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import functools
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from support import assert_close, assert_equal, random_columns, raveled, shapes_
 
 from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
-from sejax.agents.exploration import ICMConfig, ICMOutputs, icm_loss, with_icm
+from sejax.agents.exploration import ICMConfig, ICMOutputs, icm_loss
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
 GOLDEN = Path(__file__).parent / "golden" / "icm_updates.npz"
@@ -69,9 +70,11 @@ def stub_agent(kind):
 STUBS = {kind: stub_agent(kind) for kind in KINDS}
 
 
-def curious(kind, agent=None):
+def curious(kind):
     """The wrapped agent; discrete actions are indices, vectors are continuous."""
-    return with_icm(agent or STUBS[kind], CONFIG, OBS_DIM, WIDTH, is_discrete=kind == "index")
+    num_actions = WIDTH if kind == "index" else None
+    task = SimpleNamespace(obs_dim=OBS_DIM, action_dim=WIDTH, num_actions=num_actions)
+    return CONFIG.make(STUBS[kind], task)
 
 
 @functools.cache
@@ -152,9 +155,8 @@ def as_rollout(batch):
 def test_a_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind):
     batch, state = random_batch(1, kind), fresh(kind)
     rollout = as_rollout(batch)
-    before = update_of(kind)(
-        KEY, fresh(kind, learning_rate=0), batch
-    )  # the bonus by the models as they were
+    # The bonus by the models as they were.
+    before = update_of(kind)(KEY, fresh(kind, learning_rate=0), batch)
     trained = update_of(kind)(KEY, state, batch)
     after = update_of(kind)(KEY, state, rollout)
     np.testing.assert_allclose(bonus(after, batch), bonus(before, batch), rtol=1e-5, atol=1e-5)

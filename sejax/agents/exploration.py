@@ -79,9 +79,40 @@ class ICMConfig(ExplorationConfig):
     num_residual_blocks: int = option(4, counts("it counts", 0, MOST_LAYERS))
 
     def make(self, agent: Agent, task: Task) -> Agent:
-        """The agent with the bonus."""
-        is_discrete = task.num_actions is not None
-        return with_icm(agent, self, task.obs_dim, task.action_dim, is_discrete)
+        """The same agent, learning from rewards with an intrinsic bonus.
+
+        Before each learning step on `Transition`s the module takes one step of Adam on the batch;
+        then its bonus for that batch, by the models as updated, is added to the rewards that the
+        agent sees. On a `Rollout` the bonus comes first and the module's one step after it. The
+        buffer keeps rewards without the bonus, which is computed anew whenever a step is learned
+        from.
+
+        Discrete actions enter the models as one-hot vectors. An agent's own vectors for discrete
+        actions, as those of discrete TD3, enter as they are.
+
+        Args:
+          agent: one that learns from batches of `Transition`s, or from a `Rollout`.
+          task: that it is for, whose observations are vectors.
+
+        Differs: two discrete actions are treated as any other number of them, with two logits and a
+        softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete
+        actions are not one-hot, so that the inverse model learns them by their squared error.
+
+        Source: `docs/reference.md` 4.8.
+
+        Example:
+          >>> import sejax
+          >>> task = sejax.envs.make("cartpole")
+          >>> agent = ICMConfig().make(sejax.make_agent(sejax.DDQNConfig(), task), task)
+          >>> state = agent.init(jax.random.key(0), agent.hparams)
+          >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
+          True
+        """
+        module = ICM(self, task.action_dim)
+        curious = Curious(agent, module, task.obs_dim, task.num_actions is not None)
+        # The module's networks keep a core busy, whatever the agent's.
+        spec = dataclasses.replace(agent.spec, cpu_num_parallel=1)
+        return _with_bonus(agent, self, init=curious.init, update=curious.update, spec=spec)
 
 
 class CuriousState(struct.PyTreeNode):
@@ -157,60 +188,17 @@ class ICM(nn.Module):
         )
 
 
-def with_icm(
-    agent: Agent, config: ICMConfig, obs_dim: int, action_width: int, is_discrete: bool
-) -> Agent:
-    """The same agent, learning from rewards with an intrinsic bonus.
-
-    Before each learning step on `Transition`s the module takes one step of Adam on the batch; then
-    its bonus for that batch, by the models as updated, is added to the rewards that the agent sees.
-    On a `Rollout` the bonus comes first and the module's one step after it. The buffer keeps
-    rewards without the bonus, which is computed anew whenever a step is learned from.
-
-    Args:
-      agent: one that learns from batches of `Transition`s, or from a `Rollout`.
-      config: the module's sizes and numbers.
-      obs_dim: length of an observation.
-      action_width: length of an action, or number of discrete actions.
-      is_discrete: whether actions are indices, which enter the models as one-hot vectors. An
-        agent's own vectors for discrete actions, as those of discrete TD3, enter as they are.
-
-    Differs: two discrete actions are treated as any other number of them, with two logits and a
-    softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete actions
-    are not one-hot, so that the inverse model learns them by their squared error.
-
-    Source: `docs/reference.md` 4.8.
-
-    Example:
-      >>> from sejax.agents.dqn import DDQN, DDQNConfig
-      >>> plain = DDQN(DDQNConfig(), obs_dim=4, num_actions=2).agent()
-      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, action_width=2, is_discrete=True)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
-      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
-      True
-    """
-    curious = Curious(agent, ICM(config, action_width), obs_dim, is_discrete)
-    return _with_bonus(
-        agent,
-        config,
-        init=curious.init,
-        update=curious.update,
-        # The module's networks keep a core busy, whatever the agent's.
-        spec=dataclasses.replace(agent.spec, cpu_num_parallel=1),
-    )
-
-
 class Curious:
     """The pure functions of a curious agent."""
 
     def __init__(self, agent: Agent, model: ICM, obs_dim: int, is_discrete: bool):
         self.agent, self.model = agent, model
         self.obs_dim, self.is_discrete = obs_dim, is_discrete
-        self.example = (jnp.zeros(obs_dim), jnp.zeros(model.action_width), jnp.zeros(obs_dim))
 
     def init(self, key: Array, hparams: Hparams) -> CuriousState:
         key_agent, key_icm = jax.random.split(key)
-        params = self.model.init(key_icm, *self.example)
+        obs, action = jnp.zeros(self.obs_dim), jnp.zeros(self.model.action_width)
+        params = self.model.init(key_icm, obs, action, obs)
         return CuriousState(
             agent_state=self.agent.init(key_agent, hparams.agent),
             params=params,
@@ -301,6 +289,14 @@ def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
 # --- counts --------------------------------------------------------------------------------------
 
 
+class CountingState(struct.PyTreeNode):
+    """One counting agent: the state of the agent inside, and the learning steps on each pair."""
+
+    agent_state: AgentState
+    counts: Int[Array, "num_states num_actions"]
+    reward_scale: Array
+
+
 @dataclass(frozen=True, kw_only=True)
 class CountBasedConfig(ExplorationConfig):
     r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions.
@@ -316,61 +312,44 @@ class CountBasedConfig(ExplorationConfig):
     count_power: float = option(1.0, positive("the bonus would not fade"))
 
     def make(self, agent: Agent, task: Task) -> Agent:
-        """The agent with the bonus."""
-        assert task.num_states is not None and task.num_actions is not None
-        return with_count_bonus(agent, self, task.num_states, task.num_actions)
+        r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.
 
+        .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
 
-class CountingState(struct.PyTreeNode):
-    """One counting agent: the state of the agent inside, and the learning steps on each pair."""
+        for the step at hand, before the learning step of the agent inside.
 
-    agent_state: AgentState
-    counts: Int[Array, "num_states num_actions"]
-    reward_scale: Array
+        Args:
+          agent: one that learns from single steps with indices as observations and actions, from
+            `sejax.agents.tabular`.
+          task: that it is for.
 
+        Example:
+          >>> import sejax
+          >>> task = sejax.envs.make("cliff_walking")
+          >>> plain = sejax.make_agent(sejax.QLearningConfig(), task)
+          >>> agent = CountBasedConfig().make(plain, task)
+          >>> state = agent.init(jax.random.key(0), agent.hparams)
+          >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
+          0
+        """
+        shape: Any = task.num_states, task.num_actions
 
-def with_count_bonus(
-    agent: Agent, config: CountBasedConfig, num_states: int, num_actions: int
-) -> Agent:
-    r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.
+        def init(key: Array, hparams: Hparams) -> CountingState:
+            return CountingState(
+                agent_state=agent.init(key, hparams.agent),
+                counts=jnp.zeros(shape, jnp.int32),
+                reward_scale=jnp.float32(hparams.reward_scale),
+            )
 
-    .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
+        def update(key: Array, state: CountingState, transition: Transition) -> CountingState:
+            obs, action = transition.obs, transition.action
+            count = entry_of(state.counts, obs, action) + 1
+            is_visited = mask_of(obs, action, shape)
+            bonus = state.reward_scale * count.astype(jnp.float32) ** -self.count_power
+            transition = transition._replace(reward=transition.reward + bonus)
+            return state.replace(
+                agent_state=agent.update(key, state.agent_state, transition),
+                counts=jnp.where(is_visited, count, state.counts),
+            )
 
-    for the step at hand, before the learning step of the agent inside. The power p is 1 in the
-    paper's text and 1/2 in the authors' code.
-
-    Args:
-      agent: one that learns from single steps with indices as observations and actions, from
-        `sejax.agents.tabular`.
-      config: beta, in reward units, and the power.
-      num_states: number of different observations.
-      num_actions: number of different actions.
-
-    Example:
-      >>> from sejax.agents.tabular import QLearningConfig, Tabular
-      >>> plain = Tabular(QLearningConfig(), num_states=48, num_actions=4).agent()
-      >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
-      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
-      0
-    """
-
-    def init(key: Array, hparams: Hparams) -> CountingState:
-        return CountingState(
-            agent_state=agent.init(key, hparams.agent),
-            counts=jnp.zeros((num_states, num_actions), jnp.int32),
-            reward_scale=jnp.float32(hparams.reward_scale),
-        )
-
-    def update(key: Array, state: CountingState, transition: Transition) -> CountingState:
-        obs, action = transition.obs, transition.action
-        count = entry_of(state.counts, obs, action) + 1
-        is_visited = mask_of(obs, action, (num_states, num_actions))
-        bonus = state.reward_scale * count.astype(jnp.float32) ** -config.count_power
-        transition = transition._replace(reward=transition.reward + bonus)
-        return state.replace(
-            agent_state=agent.update(key, state.agent_state, transition),
-            counts=jnp.where(is_visited, count, state.counts),
-        )
-
-    return _with_bonus(agent, config, init=init, update=update)
+        return _with_bonus(agent, self, init=init, update=update)

@@ -67,13 +67,10 @@ class Mixture:
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
         is_weighted = min(self.weights, default=0) >= 0 and max(self.weights, default=0) > 0
-        require(
-            is_weighted and len(self.names) == len(self.weights) == size,
-            "agents",
-            "must have a name and a weight each, one above 0 and none below; got "
-            f"{size} agents, names={shortened(self.names)} and weights={shortened(self.weights)}. "
-            "Set names=() and weights=().",
-        )
+        is_whole = is_weighted and len(self.names) == len(self.weights) == size
+        must = f"must have a name and a weight each, one above 0 and none below; got {size} agents"
+        got = f"names={shortened(self.names)} and weights={shortened(self.weights)}"
+        require(is_whole, "agents", f"{must}, {got}. Set names=() and weights=().")
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":
@@ -107,12 +104,12 @@ class Mixture:
         for candidate in range(num_dealt):
             behind = shares * (candidate + 1) - [len(hand) for hand in hands]
             hands[int(np.argmax(behind))].append(candidate)
-        require(
-            all(hand for hand, share in zip(hands, shares, strict=True) if share > 0),
-            "es.population_size",
-            f"must leave each agent a candidate; got {num_dealt} perturbations for weights "
-            f"{shortened(self.weights)}. Set es.population_size={2 * max(num_dealt, self.size)}.",
+        are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
+        field, size = "es.population_size", 2 * max(num_dealt, self.size)
+        got = (
+            f"{num_dealt} perturbations for weights {shortened(self.weights)}. Set {field}={size}."
         )
+        require(are_enough, field, f"must leave each agent a candidate; got {got}")
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 

@@ -49,12 +49,8 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
     cls, hints = type(config), get_type_hints(type(config))
     names = [field.name for field in dataclasses.fields(config)]
     how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
-    require(
-        how,
-        "agent_hparams",
-        f"must be default with {cls.__name__}, none of whose options has `varied` set; got varied. "
-        "Set agent_hparams=default.",
-    )
+    must = f"must be default with {cls.__name__}, none of whose options has `varied` set"
+    require(how, "agent_hparams", f"{must}; got varied. Set agent_hparams=default.")
     # Traced ones first: the order says which key draws what.
     ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])
     return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
@@ -130,20 +126,11 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
         }
         traced = {name: x for name, x in values.items() if name != "num_layers"}
         hparams = with_hparams(variants[0].hparams, traced)
-        return smallest_with_room(shapes, values), hparams, values
+        depth, units = values.get("num_layers"), values.get("hidden_size")
+        too_small = [(x < depth) | ((x == depth) & (size < units)) for x, size in shapes]
+        return jnp.int32(sum(too_small)), hparams, values  # the smallest that has room
 
     spec = agent.spec
     if len(variants) > 1:  # under vmap all branches would run
         spec = dataclasses.replace(spec, cpu_num_parallel=1)
     return dataclasses.replace(agent, spec=spec, varied=Varied(agents=tuple(variants), draw=draw))
-
-
-def smallest_with_room(shapes: list[tuple[int, int]], values: dict[str, Array]) -> Array:
-    """Index of the first shape, (depth, hidden units), that has room for what was drawn."""
-    if not shapes:
-        return jnp.int32(0)
-    depths, rooms = jnp.array(shapes).T
-    too_small = (depths < values["num_layers"]) | (
-        (depths == values["num_layers"]) & (rooms < values["hidden_size"])
-    )
-    return jnp.sum(too_small).astype(jnp.int32)

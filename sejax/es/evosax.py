@@ -120,7 +120,14 @@ def from_evosax(
     def tell(
         key: Array, population: Array, scores: Array, incumbent_score: Array, state: StrategyState
     ) -> StrategyState:
-        fitness = finite_fitness(-scores, jnp.inf if remembers_scores else 0.0)
+        # An infinity would poison the algorithms that standardise: what is not finite is worse than
+        # the worst by the gap between best and worst, or by 1.
+        finite, fitness = jnp.isfinite(scores), -scores
+        worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
+        best = jnp.min(jnp.where(finite, fitness, jnp.inf))
+        of_none = jnp.inf if remembers_scores else 0.0
+        others = jnp.where(finite.any(), worst + jnp.maximum(worst - best, 1.0), of_none)
+        fitness = jnp.where(finite, fitness, others)
         return algorithm.tell(key, population, fitness, state, params)[0]
 
     return Strategy(
@@ -133,16 +140,3 @@ def from_evosax(
         remembers_scores=remembers_scores,
         evaluations=evaluations,
     )
-
-
-def finite_fitness(fitness: Float[Array, " pop"], of_none: float) -> Float[Array, " pop"]:
-    """Fitness (minimised) with entries that are not finite just worse than the worst finite one.
-
-    An infinity would poison the algorithms that standardise, so the gap is that between best and
-    worst, or 1. Where none is finite all are `of_none`.
-    """
-    finite = jnp.isfinite(fitness)
-    worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
-    best = jnp.min(jnp.where(finite, fitness, jnp.inf))
-    replacement = worst + jnp.maximum(worst - best, 1.0)
-    return jnp.where(finite, fitness, jnp.where(finite.any(), replacement, of_none))

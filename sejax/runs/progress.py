@@ -23,10 +23,8 @@ class RunProgress:
         self._is_quiet = is_quiet
         env, proxy = config.name("env"), config.name("proxy")
         if f"{env}-{proxy}" not in compose.PRESETS:
-            self.say(
-                f"There are no tuned settings for env={env} with proxy={proxy}: these are general "
-                "ones, not tuned (docs/defaults.md)."
-            )
+            none = f"There are no tuned settings for env={env} with proxy={proxy}"
+            self.say(f"{none}: these are general ones, not tuned (docs/defaults.md).")
 
     def status(self, text: str) -> None:
         """Prints what is being done before the first generation."""
