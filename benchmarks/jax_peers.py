@@ -28,6 +28,7 @@ WIDTHS = {64: 1024, 256: 256}  # units of a layer -> steps of a training
 PPO_STEPS = 128 * 16
 SIDES = ("sejax", "rejax")
 MODES = ("map", "vmap")
+HEAD = ["agent, units, task", "world", "agents", *SIDES, "rejax / sejax", "vmap / map of sejax"]
 GYMNAX_NAMES = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
 
 
@@ -56,14 +57,16 @@ def main() -> None:
             seconds = {f"{side}_compile_s": x[0]["compile_s"] for side, x in answers.items()}
             rows.append(row | seconds)
     table = best_of_modes(rows)
-    common.print_table(
-        "CPU microseconds a step on one core, the better of map and vmap",
-        ["algorithm, units, task", "world", "agents", *SIDES, "rejax / sejax", "vmap / map"],
-        [[x["case"], x["world"], x["agents"], *(f"{x[side]:.1f}" for side in SIDES),
-          f"{x['ratio']:.2f}", f"{x['vmap_over_map']:.2f}"] for x in table],
-    )  # fmt: skip
-    if args.figure:
-        draw(table, args.figure, machine["cpu"])
+    rows_of_table = [
+        [x["case"], x["world"], x["agents"], *(f"{x[side]:.1f}" for side in SIDES),
+         f"{x['ratio']:.2f}", f"{x['vmap_over_map']:.2f}"] for x in table
+    ]  # fmt: skip
+    common.print_table("CPU microseconds a step, the better of map and vmap", HEAD, rows_of_table)
+    if args.out:
+        lines = [HEAD, ["---"] * len(HEAD), *rows_of_table]
+        text = "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
+        (args.out / "table.md").write_text(text)
+        draw(table, args.out / "figure.png", machine["cpu"])
     common.finish("jax_peers", args, {"machine": machine, "rows": rows, "table": table})
 
 
@@ -73,7 +76,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", nargs="+", choices=("task", "se"), default=["task", "se"])
     parser.add_argument("--agents", nargs="+", type=int, default=[1, 16], help="in a program")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--figure", type=Path, metavar="PATH", help="draw the table there")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write table and figure there")
     common.add_core(parser)
 
 
@@ -84,22 +87,21 @@ def best_of_modes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         times = {side: [row[f"{side}_us"]["median"] for row in (by_map, by_vmap)] for side in SIDES}
         best = {side: min(values) for side, values in times.items()}
         mapped, vmapped = times["sejax"]
-        row = {name: by_map[name] for name in ("case", "world", "agents")}
         ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": vmapped / mapped}
-        table.append(row | best | ratios)
+        table.append({x: by_map[x] for x in ("case", "world", "agents")} | best | ratios)
     return table
 
 
 def draw(table: list[dict[str, Any]], path: Path, cpu: str) -> None:
     """Bars of both sides, a group for each case on the task with most agents."""
     import matplotlib.pyplot as plt
+    import numpy as np
 
     most = max(row["agents"] for row in table)
     shown = [row for row in table if row["agents"] == most and row["world"] == table[0]["world"]]
     figure, axes = plt.subplots(figsize=(7, 0.4 * len(shown) + 1.2), layout="constrained")
     for offset, side in ((-0.2, "sejax"), (0.2, "rejax")):
-        places = [i + offset for i in range(len(shown))]
-        axes.barh(places, [row[side] for row in shown], 0.4, label=side)
+        axes.barh(np.arange(len(shown)) + offset, [row[side] for row in shown], 0.4, label=side)
     axes.set_yticks(range(len(shown)), [row["case"] for row in shown])
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel=f"CPU microseconds a step, one core of an {cpu}")
