@@ -26,8 +26,7 @@ def save(path, *words):
     config = sejax.config(words)
     env = config.parts()["proxy"]
     record = {"learning": {"command": "a test", "generations": 1, "real_steps": 1000}}
-    plain = configuration.plain(config)
-    sejax.save(path, env, env.init_weights(np.uint32([0, 3])), plain, 0.8, **record)
+    sejax.save(path, env, env.init_weights(np.uint32([0, 3])), config.plain(), 0.8, **record)
     return path
 
 
@@ -77,7 +76,7 @@ def test_a_policy_that_is_written_down_is_a_stored_policy(tmp_path, capsys):
     gains = np.array([0.1, 0.3, 1.0, 0.6])  # of `experiments.common.bandits`
     states = np.random.default_rng(0).normal(0, [1.0, 0.5, 0.1, 0.5], (1000, 4))
     env, weights = make_exact(task, [(np.stack([-gains, gains]), np.zeros(2))], states)
-    config = configuration.plain(sejax.config(["env=cartpole"]))
+    config = sejax.config(["env=cartpole"]).plain()
     sejax.save(tmp_path / "mine.safetensors", env, weights, {"agents": config["agents"],
                "training": config["training"]}, policy_return=200.0)  # fmt: skip
     found = run(tmp_path / "mine.safetensors", out_dir=tmp_path / "out", algorithms="[]")

@@ -57,11 +57,11 @@ class RunProgress:
         path, solved_score = directory.path, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
         verdict = f"best search mean {best:.1f}"
-        if bilevel.scoring.objective.meaning:
-            verdict += f": {bilevel.scoring.objective.meaning}"
         if solved_score is not None:
-            verdict = "solved" if is_solved else "not solved"
-            verdict += f": best search mean {best:.1f}, solved at {solved_score:g}"
+            is_not = "" if is_solved else "not "
+            verdict = f"{is_not}solved: {verdict}, solved at {solved_score:g}"
+        elif bilevel.scoring.objective.meaning:
+            verdict += f": {bilevel.scoring.objective.meaning}"
         ending = "solved" if is_solved else "learned"
         self.say(
             f"\n{bilevel.proxy.task.name}: {ending}\n"

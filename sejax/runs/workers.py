@@ -270,10 +270,9 @@ def num_workers(machines: RayConfig) -> int:
 
     here = ray.get_runtime_context().get_node_id()
     if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
-        raise FailedError(
-            "Ray has ended on this machine, so that no training can be sent out. The generations "
-            "before are saved; start Ray and repeat the command to resume."
-        )
+        fix = "The generations before are saved; start Ray and repeat the command to resume."
+        message = f"Ray has ended on this machine, so that no training can be sent out. {fix}"
+        raise FailedError(message)
     return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
@@ -300,10 +299,9 @@ def _on_cluster(
         results: list[Any] = ray.get(tasks)
     except ray.exceptions.RayError as error:  # its last line is what the worker raised
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
-        raise FailedError(
-            f"A worker has failed: {reason}. What was finished before is saved; the same command "
-            f"with machines=local resumes here."
-        ) from error
+        fix = "the same command with machines=local resumes here."
+        message = f"A worker has failed: {reason}. What was finished before is saved; {fix}"
+        raise FailedError(message) from error
     return results
 
 
