@@ -13,7 +13,6 @@ compilation is not in the time of a step and stands beside it.
 import argparse
 import itertools
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +43,10 @@ def main() -> None:
         for algorithm, tasks in ALGORITHMS.items() for width in WIDTHS for task in tasks
     ]  # fmt: skip
     cases = args.cases or cases[: 1 if args.quick else None]
-    numbers = [1, 4] if args.quick else args.agents
     machine = common.machine(("jax", "rejax", "sejax"))
     rows = []
     with common.sides_of(__file__, SIDES, core=args.core, seed=args.seed) as sides:
-        for case, world, agents, mode in itertools.product(cases, args.worlds, numbers, MODES):
+        for case, world, agents, mode in itertools.product(cases, args.worlds, args.agents, MODES):
             request = {"case": case, "world": world, "agents": agents, "mode": mode}
             answers = common.in_turns(sides, [request] * args.repeats)
             row = request | {
@@ -156,9 +154,7 @@ def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
     return task, env, env.params(env.init_weights(jax.random.key(0)))
 
 
-def sejax_trainer(
-    algorithm: str, width: int, task_name: str, world: str, steps: int
-) -> Callable[[Any], Any]:
+def sejax_trainer(algorithm: str, width: int, task_name: str, world: str, steps: int) -> Any:
     """`key -> trained agent`."""
     import sejax
 
@@ -169,17 +165,15 @@ def sejax_trainer(
         config: Any = sejax.PPOConfig(**network, **rollouts, activation="tanh")
     else:
         network |= {"batch_size": 64, "buffer_size": steps, "warmup_episodes": 0}
-        configs = {"ddqn": sejax.DDQNConfig, "sac": sejax.SACConfig, "td3": sejax.TD3Config}
-        config = configs[algorithm](**network, activation="relu")
+        make = {"ddqn": sejax.DDQNConfig, "sac": sejax.SACConfig, "td3": sejax.TD3Config}[algorithm]
+        config = make(**network, activation="relu")
     agent = sejax.make_agent(config, task)
     training = sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
     train = sejax.make_trainer(agent, env, training)
     return lambda key: train(key, params).agent_state
 
 
-def rejax_trainer(
-    algorithm: str, width: int, task_name: str, world: str, steps: int
-) -> Callable[[Any], Any]:
+def rejax_trainer(algorithm: str, width: int, task_name: str, world: str, steps: int) -> Any:
     """`key -> parameters of the networks`."""
     import jax.numpy as jnp
     import rejax

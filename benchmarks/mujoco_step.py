@@ -1,7 +1,8 @@
-"""What a step of the MuJoCo tasks costs: sejax's, beside Gymnasium's.
+"""What a step of the MuJoCo tasks costs: sejax's, beside Gymnasium's and, on HalfCheetah, brax's.
 
 All on one core, in CPU time: sejax's steps in a compiled loop, `gymnasium.make(...).step` in a
-loop of Python, and Gymnasium's `SyncVectorEnv`, for each of its environments. They get the same
+loop of Python, Gymnasium's `SyncVectorEnv`, for each of its environments, and the physics of mjx
+and of brax's spring in a compiled loop. They get the same
 actions, sinusoids of another phase for each joint. The vector environment resets what has fallen;
 elsewhere it goes on lying. They are measured in turn, so that they meet the same machine.
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 TASKS = ("halfcheetah", "hopper", "walker2d", "swimmer", "inverted_pendulum", "ant", "reacher")
 SIDES = ("mujoco", "gymnasium", "vector")
+ON_HALFCHEETAH = ("mjx", "spring")
 NUM_ENVS = 16  # of the vector environment
 NUM_STEPS = 2000
 
@@ -22,11 +24,11 @@ NUM_STEPS = 2000
 def main() -> None:
     args = common.parse_args(__doc__, add_options)
     if args.side:
-        {"mujoco": serve_sejax}.get(args.side, serve_gymnasium)(args)
+        {"gymnasium": serve_gymnasium, "vector": serve_gymnasium}.get(args.side, serve_sejax)(args)
         return
     if args.quick:
         args.tasks, args.repeats = args.tasks[:1], min(args.repeats, 2)
-    where = common.machine(("jax", "mujoco", "gymnasium", "sejax"))
+    where = common.machine(("jax", "mujoco", "brax", "gymnasium", "sejax"))
     result: dict[str, Any] = {"tasks": {}, "machine": where}
     for task in args.tasks:
         result["tasks"][task] = compare(task, args)
@@ -43,7 +45,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def compare(task: str, args: argparse.Namespace) -> dict[str, Any]:
     """Microseconds of a step of each side, and how many times sejax's that is, in pairs."""
-    with common.sides_of(__file__, SIDES, task=task, core=args.core) as sides:
+    names = (*SIDES, *(ON_HALFCHEETAH if task == "halfcheetah" else ()))
+    with common.sides_of(__file__, names, task=task, core=args.core) as sides:
         compiled = {name: side.ready["compile_s"] for name, side in sides.items()}
         answers = common.in_turns(sides, [{}] * args.repeats)
     times = {name: [answer["us"] for answer in x] for name, x in answers.items()}
@@ -99,7 +102,7 @@ def serve_gymnasium(args: argparse.Namespace) -> None:
 
 
 def serve_sejax(args: argparse.Namespace) -> None:
-    """The side of sejax."""
+    """The side of one of sejax's physics."""
     os.sched_setaffinity(0, {args.core})
     from sejax.runs.runtime import configure_xla
 
@@ -108,7 +111,9 @@ def serve_sejax(args: argparse.Namespace) -> None:
 
     from sejax import envs
 
-    key, walk_once = jax.random.key(args.seed), jax.jit(walk_of(envs.make(args.task)))
+    options = {} if args.side == "mujoco" else {"backend": args.side}
+    key, task = jax.random.key(args.seed), envs.make(args.task, **options)
+    walk_once = jax.jit(walk_of(task))
     walk, used = common.measure(lambda: walk_once.lower(key).compile())
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:

@@ -1,20 +1,39 @@
-"""Draws `docs/overview.png`, README's picture: the two loops, and what stock agents learn on an SE.
+"""Draws the pictures of README and of What an SE teaches, of stored rows.
 
-    python docs/overview.py
+    python -m docs.overview
 
-The right panel has the rows of `results/stock_agents/`: five seeds of each Stable-Baselines3 agent
-with RL Zoo's hyperparameters, tested on Gymnasium's Acrobot.
+`docs/overview.png`: the two loops, and what agents learn on the SE of Acrobot and on the task. Five
+seeds of each Stable-Baselines3 agent with RL Zoo's hyperparameters (`results/stock_agents/`), and
+twenty of the tuned PPO of `results/break_even/`.
+
+`docs/costs.png`: what SEs of CartPole cost and teach (`results/null_baselines/`), the table of
+README.
 """
 
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
+from experiments import null_baselines
+from experiments.common.curves import on_grid
+
 ROOT = Path(__file__).parents[1]
-BLUE, GREY = "#2166ac", "#8c8c8c"
+BLUE, GREY, ORANGE = "#2166ac", "#8c8c8c", "#d95f02"
+GRID = np.arange(1000, 20_001, 1000)
+SOURCES = {"by_hand": "controller by hand", "agent": "one {}", "best_of_four": "best of four {}"}
+COLORS = {
+    "controller by hand": "#009E73",
+    "one PPO": "#56B4E9",
+    "best of four PPO": "#0072B2",
+    "one DDQN": "#E69F00",
+    "best of four DDQN": "#B03A73",
+    "the evolved SE that ships": "#000000",
+}
+MARKERS = {"ddqn": ("o", ""), "td3_discrete": ("^", "white")}
 STYLES = {"a2c": "-", "ppo": "--", "dqn": ":"}
 BOXES = {
     "es": (0.5, 0.87, "evolution strategy\nperturbs the weights"),
@@ -54,18 +73,45 @@ def draw_agents(axes: Axes) -> None:
     # 5,000 steps are between 2,500 and 6,000 of the other trainings.
     on_se = rows.query("world != 'the real task' and steps != 5000")
     on_task = rows.query("world == 'the real task' and total_steps > 20_000 and steps <= 20_000")
-    for rows, color, place in ((on_se, BLUE, "the SE"), (on_task, GREY, "the task")):
+    for rows, color, world in ((on_se, BLUE, "the SE"), (on_task, GREY, "the task")):
         for agent, line in STYLES.items():
             means = rows[rows["agent"] == agent].groupby("steps")["mean_return"].mean()
-            label = f"{agent.upper()} on {place}"
+            label = f"{agent.upper()} on {world}"
             axes.plot(means.index, means, line, color=color, linewidth=1.8, label=label)
+    rows = pd.read_csv(ROOT / "results/break_even/rows.csv.xz")
+    tuned = on_grid(rows[(rows["table"] == "curves") & (rows["proxy"] == "acrobot")], GRID)
+    axes.plot(GRID, tuned.mean(axis=0), color=ORANGE, linewidth=1.8, label="tuned PPO on the task")
     axes.axhline(-100, color="black", linewidth=0.6)
-    axes.text(20_000, -107, "solved", ha="right", va="top", fontsize=8)
+    axes.text(20_500, -104, "solved", ha="left", va="center", fontsize=8)
     axes.set(xlabel="training steps", ylabel="return on the real Acrobot", xlim=(0, 20_500))
     axes.set_xticks(range(0, 20_001, 5000))
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    axes.set_title("Stable-Baselines3's agents on Acrobot")
-    axes.legend(frameon=False, fontsize=8, loc="center right", bbox_to_anchor=(1, 0.62))
+    axes.set_title("Agents on Acrobot")
+    axes.legend(frameon=False, fontsize=8, loc="center right", bbox_to_anchor=(1, 0.6))
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_costs(axes: Axes) -> None:
+    """Scores on SEs of CartPole against the real steps that each SE took."""
+    folders = {"cartpole-noise": SOURCES, "cartpole": {"evolved": "the evolved SE that ships"}}
+    for folder, sources in folders.items():
+        rows = pd.read_csv(ROOT / f"results/null_baselines/{folder}/rows.csv.xz")
+        summary = null_baselines.summarise(null_baselines.NullBaselines(), rows)
+        for row in summary[summary["hparams"] == "default"].itertuples():
+            name = sources.get(row.source, "").format(row.teacher.upper())
+            if name and row.kind in MARKERS:
+                mark, fill = MARKERS[row.kind]
+                spot = row.real_steps, row.test_return_mean
+                axes.plot(*spot, mark, color=COLORS[name], mfc=fill or COLORS[name], ms=8)
+    for name, color in COLORS.items():
+        axes.plot([], [], "s", color=color, label=name)
+    for label, (mark, fill) in zip(("DDQN", "discrete TD3"), MARKERS.values(), strict=True):
+        axes.plot([], [], mark, color="black", mfc=fill or "black", label=label)
+    axes.axhline(195, color="black", linestyle="--", linewidth=0.8)
+    axes.text(4e7, 193, "solved", ha="right", va="top", fontsize=8)
+    axes.set(xscale="log", xlim=(1e3, 5e7), ylim=(0, 210))
+    axes.set(xlabel="real steps to make the SE", ylabel="return on the real CartPole")
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)
 
 
@@ -74,3 +120,6 @@ figure.get_layout_engine().set(wspace=0.08)
 draw_loops(loops)
 draw_agents(agents)
 figure.savefig(ROOT / "docs/overview.png", dpi=130)
+figure, costs = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
+draw_costs(costs)
+figure.savefig(ROOT / "docs/costs.png", dpi=130)

@@ -172,7 +172,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "proxy": row["proxy"],
-            "real steps to learn it": tables.known_text(row["learning_steps"], ",.0f"),
+            "real steps to learn it": tables.steps_text(row["learning_steps"]),
             "agents on it": users_text(row, "student"),
             "the same on the task": users_text(row, "same"),
             "tuned on the task": users_text(row, "tuned"),

@@ -267,28 +267,28 @@ NAMES = {
 
 def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(settings, rows)
-    draw(settings, summary)
     shown = []
     by = ["source", "teacher", "hparams"]
     for (source, teacher, hparams), mine in summary.groupby(by, sort=False):
         first = mine.iloc[0]
-        cells = {figures.agent_name(str(row.kind)): cell(row) for row in mine.itertuples()}
+        cells = {
+            figures.agent_name(str(row.kind)): f"{row.test_return_mean:,.1f} ({row.solved:.0%})"
+            for row in mine.itertuples()
+        }
         costs = {
             "SE of": label(source, teacher),
-            "real steps": f"{first['real_steps']:,.0f}",
-            "CPU s": f"{first['cpu_s']:,.2f}",
+            "real steps": tables.steps_text(first["real_steps"]),
+            "CPU s": f"{first['cpu_s']:,.2f}" if first["cpu_s"] >= 0.01 else "< 0.01",
             "the policy itself": tables.known_text(first["policy_return"], ",.1f"),
-            "hyperparameters": hparams,
+            "hyperparameters": "random" if hparams == "varied" else hparams,
         }
         shown.append(costs | cells)
     table = pd.DataFrame(shown)
-    budgets, most = settings.budgets, settings.budgets[-1]
     note = (
-        f"Cells: mean return of fresh agents after {most:,} steps on the SE (mean of the worst "
-        f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
-        f"the median agent has solved it, of {', '.join(f'{x:,}' for x in budgets)}). Real steps "
-        "of making one SE have tests in them, CPU seconds of SEs of policies neither tests nor "
-        "compilation. Costs of the best of four are those of all four."
+        f"Cells: mean return of fresh agents after {settings.budgets[-1]:,} steps on the SE (share "
+        f"that solves the task, {settings.task.solved_reward:g}). Real steps of making one SE have "
+        "tests in them, CPU seconds of SEs of policies neither tests nor compilation. Costs of the "
+        "best of four are those of all four."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)
@@ -300,30 +300,6 @@ def label(source: str, teacher: str) -> str:
         return f"{NAMES[source]} ({teacher})"
     is_taught = source in ("agent", "best_of_four", "episodes")
     return NAMES[source] + (f": {figures.agent_name(teacher)}" if is_taught else "")
-
-
-def cell(row: Any) -> str:
-    """What one kind of student reaches."""
-    steps = row.median_steps_until_solved
-    until = f"; {steps:,.0f}" if row.hparams == "default" and np.isfinite(steps) else ""
-    return f"{row.test_return_mean:,.1f} ({row.worst_tenth:,.1f}; {row.solved:.0%}{until})"
-
-
-def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
-    """Students' mean returns against the real steps that a proxy cost."""
-    mine = summary[summary["hparams"] == settings.hparams[0]]
-    proxies = mine.groupby(["source", "teacher"], sort=False)
-    with figures.panels(settings.folder / "costs.png", 1, 1, (6.4, 3.6)) as (_, [[axes]]):
-        for marker, ((source, teacher), points) in zip("osD^v<>Ph*", proxies, strict=False):
-            steps, returns = points["real_steps"].clip(lower=1), points["test_return_mean"]
-            axes.plot(steps, returns, marker, label=label(source, teacher))
-        figures.threshold(axes, settings.task.solved_reward)
-        axes.set(
-            xscale="log",
-            xlabel="real steps to make the SE",
-            ylabel="return of each algorithm on it",
-        )
-        axes.legend(fontsize=7)
 
 
 EXPERIMENT = Experiment(settings=NullBaselines, compute=compute, report=report, about=__doc__)

@@ -270,7 +270,7 @@ def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
 def draw(settings: Peers, summary: pd.DataFrame) -> None:
     """Draws mean scores against steps on the SE, a panel for each task."""
     tasks = dict(list(summary[summary["kind"] == ALL].groupby("task", sort=False)))
-    size = (1.0 + 2.4 * max(len(tasks), 2), 3.4)
+    size = (1.0 + 2.4 * max(len(tasks), 4), 3.4)  # four columns of labels fit
     with figures.panels(settings.folder / "peers.png", 1, len(tasks), size) as (figure, axes):
         for axis, (name, sorts) in zip(axes[0], tasks.items(), strict=True):
             for row, (se, color) in itertools.product(sorts.itertuples(), SES.items()):

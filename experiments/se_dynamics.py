@@ -41,6 +41,14 @@ KINDS: dict[str, tuple[str, ...]] = {
     "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
     "ten_steps": (*WHOLE, "proxy.horizon=10", "proxy.done=threshold"),
 }
+NAMES = {  # as people write them
+    "bandit": "one step",
+    "soft": "the paper's kind",
+    "threshold": "terminations at a threshold",
+    "bernoulli": "random terminations",
+    "shortest": "threshold, no short episodes",
+    "ten_steps": "ten steps",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,11 +189,11 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(curves, agents, task.solved_reward)
     draw(task, curves, settings.folder / "curves.png")
     columns: dict[str, Any] = {
-        "SE": lambda row: name_of(row.kind),
+        "SE": lambda row: NAMES[row.kind],
         "steps of an episode": "{episode_steps:.1f}",
         "first solved": "{first_solved} of {runs}",
         "in generation": lambda row: tables.known_text(row.generations_to_solve, ",.0f") or "-",
-        "real steps": lambda row: tables.known_text(row.steps_to_solve, ",.0f") or "-",
+        "real steps": lambda row: tables.steps_text(row.steps_to_solve),
         "CPU s": lambda row: tables.known_text(row.cpu_s_to_solve, ",.0f") or "-",
         "CPU s a generation": "{cpu_s:.2f}",
         "SEs that solve": "{solved} of {runs}",
@@ -209,11 +217,6 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
 
 
-def name_of(kind: str) -> str:
-    """A kind of SE as people write it."""
-    return "one step" if kind == "bandit" else kind.replace("_", " ")
-
-
 def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
     """Draws the NES runs of each kind."""
     kinds = list(curves.groupby("kind", sort=False))
@@ -224,7 +227,7 @@ def draw(task: Task, curves: pd.DataFrame, path: Path) -> None:
             axis.remove()
         for axis, (kind, mine) in zip(axes.flat, kinds, strict=False):
             figures.runs(axis, mine, task.solved_reward)
-            axis.set_title(name_of(kind), fontsize=10)
+            axis.set_title(NAMES[kind], fontsize=10)
         for axis in axes[:, 0]:
             axis.set_ylabel("search mean, return")
 

@@ -244,11 +244,11 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(unstack(rows, "ses"), unstack(rows, "agents"), task.solved_reward)
     draw(settings, summary)
     shown: dict[str, Any] = {
-        "SEs": "{set}",
+        "SEs": lambda row: name_of(row.set),
         "number": "{num_ses}",
         "horizon": "{horizon:.0f} ({at_limit})",
-        "ends": "{done}",
-        "starts": "{initial_state}",
+        "terminations": "{done}",
+        "initial states": "{initial_state}",
         "steps of an episode": "{steps:.1f}",
     }
     for discount in DISCOUNTS:
@@ -273,6 +273,11 @@ def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, table, summary, note)
 
 
+def name_of(ses: str) -> str:
+    """A set of SEs as people write it."""
+    return NAMES.get(ses.rpartition("/")[2].partition("-")[2], ses)
+
+
 def column(discount: float) -> str:
     """Name of the columns about agents with this discount."""
     return f"return_{discount:g}".replace(".", "_")
@@ -285,27 +290,27 @@ def cell(name: str) -> Any:
 
 
 def draw(settings: SeMyopia, summary: pd.DataFrame) -> None:
-    """Mean returns against discounts: a line for each set, with the verdict on most of its SEs."""
+    """Mean returns against discounts: a line for each set."""
     task = envs.make(settings.env)
-    with figures.panels(settings.folder / "myopia.png", 1, 1, (6.4, 3.8)) as (figure, [[axes]]):
+    with figures.panels(settings.folder / "myopia.png", 1, 1, (7.6, 3.8)) as (figure, [[axes]]):
         for row in summary.to_dict("records"):
             means = [row[f"{column(discount)}_mean"] for discount in DISCOUNTS]
-            kind = next(x for x in KINDS if row["verdict"].startswith(x))
-            axes.plot(range(len(DISCOUNTS)), means, "o-", ms=3, lw=1, color=KINDS[kind], alpha=0.7)
-        for kind, color in KINDS.items():
-            axes.plot([], [], "o-", ms=3, lw=1, color=color, label=kind)
-        figures.threshold(axes, task.solved_reward)
+            axes.plot(range(len(DISCOUNTS)), means, "o-", ms=4, lw=1.4, label=name_of(row["set"]))
+        figures.threshold(axes, task.solved_reward, f"solved ({task.solved_reward:g})")
         axes.set_xticks(range(len(DISCOUNTS)), [f"{x:g}" for x in DISCOUNTS])
         axes.set(xlabel="discount of the agents", ylabel=f"mean return on {task.name}")
-        figures.legend_above(figure, axes)
+        figure.legend(loc="outside right center", fontsize=8)
 
 
-KINDS = {
-    "policy": figures.REAL,
-    "dynamics": figures.FIXED,
-    "open": figures.VARIED,
-    "teaches little": "#999999",
+NAMES = {  # of sets, by the folders of se_feasibility
+    "fixed": "preset=soft",
+    "varied": "preset=soft, random hyperparameters",
+    "one-step": "one step",
+    "one-step-varied": "one step, random hyperparameters",
+    "paper": "preset=paper",
+    "performance": "preset=paper_performance",
 }
+KINDS = ("policy", "dynamics", "open", "teaches little")  # of verdicts
 EXPERIMENT = Experiment(settings=SeMyopia, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":

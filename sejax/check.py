@@ -117,9 +117,10 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
 def run(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents that are missing, and says what was found; see `check`."""
-    proxy, learned = loaded(config), config.agents
+    proxy, learned = loaded(config), dict[str, Any](config.agents)
     task = proxy.task
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # or it says why it cannot
+    require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
@@ -133,7 +134,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
             f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
         }
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
-    config = dataclasses.replace(config, agents=students, baseline=True)
+    config = dataclasses.replace(config, agents=students)
     on_proxy, on_task = setup_of(config)[0].values()
     folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
     settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
@@ -217,17 +218,17 @@ def _told(
     table["solved"] = table["test_return"] >= task.solved_reward
     by_agent = table.groupby(["world", "agent"], sort=False)
     scores = {name: score.to_numpy() for name, score in by_agent["score"]}
-    judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
+    judgements, goal = {}, float(task.solved_reward)
     for key in learned:
         floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
         myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
-        judgements[key] = judge(myopic, scores[OWN, key], floor, top)
+        judgements[key] = judge(myopic, scores[OWN, key], floor, 0.0 if is_rn else goal)
     shares = by_agent["solved"].mean().map("{:.0%}".format).reset_index("agent")
     solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     summary = summarise(table, ["world"])
-    steps, cost = summary["train_steps_mean"], _cost(proxy.path)
-    if cost:
-        saved = min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]
+    steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
+    if cost := _cost(proxy.path):  # never, where its agents do not reach the solved score
+        saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())
     found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}

@@ -83,7 +83,7 @@ def test_a_policy_that_is_written_down_is_a_stored_policy(tmp_path, capsys):
     assert found["verdict"] == "a stored policy" and found["judgements"]["ddqn"]["loss"] == 0
     assert found["worlds"]["the proxy"]["test_return_mean"] > 195
     assert found["null_se"]["return"] >= 195 and found["null_se"]["real_steps"] < 200_000
-    assert found["worlds"]["the null SE"]["solved"] == "ddqn 100%" and not found["cost"]
+    assert found["worlds"]["the null SE"]["test_return_mean"] > 150 and not found["cost"]
     assert "verdict: a stored policy\n" in capsys.readouterr().out
 
 
@@ -97,7 +97,7 @@ def test_a_check_has_a_row_for_each_comparison_and_writes_what_it_returns(whole,
     assert shares[:5] == [*(f"q_learning-{x:g}" for x in (0, 0.5, 0.9)), "q_learning", "sarsa"]
     steps = [found["worlds"][name]["train_steps_mean"] for name in names]
     assert steps[:5] == [50] * 5 and steps[-1] == 1
-    assert found["cost"]["agents_to_break_even"] == round(1000 / min(steps[5:7]))
+    assert found["cost"]["agents_to_break_even"] == "never"  # its agents do not solve the task
     assert json.loads((folder / "check/check.json").read_text()) == found
     assert is_drawn(folder / "check/check.png")
     assert run(folder / "mine.safetensors", out_dir=folder / "check") == found  # trains nobody

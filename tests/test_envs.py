@@ -317,16 +317,3 @@ def test_a_trainer_counts_steps_of_the_world():
     assert result.train_steps == MAX_EPISODES * MAX_STEPS  # 3 + 1 steps in each episode
     assert result.episodes == MAX_EPISODES
     np.testing.assert_array_equal(result.returns, 1.0)
-
-
-@pytest.mark.parametrize("limit", [1, 10])
-def test_an_environment_with_one_done_is_the_same_but_for_the_ends_of_its_step(limit):
-    task = envs.make("cartpole")
-    params = task.params.replace(max_steps_in_episode=limit)
-    env = envs.with_one_done(task.env)
-    _, state = env.reset(KEY, params)
-    *rest, done, info = jax.jit(env.step)(KEY, state, 1, params)
-    obs, after, reward, terminated, truncated, more = task.env.step(KEY, state, 1, params)
-    assert_equal((*rest, info), (obs, after, reward, more))
-    assert done == (terminated | truncated) == (limit == 1)
-    assert env.num_actions == task.env.num_actions == 2

@@ -34,6 +34,16 @@ def task_of(gymnax_id, **options):
     return envs.make(PREFIX + gymnax_id, **options)
 
 
+@pytest.mark.parametrize("limit", [1, 10])
+def test_an_environment_with_one_done_is_the_same_but_for_the_ends_of_its_step(limit):
+    task = envs.make("cartpole")
+    env, params = envs.with_one_done(task.env), task.params.replace(max_steps_in_episode=limit)
+    _, state = env.reset(KEY, params)
+    *same, terminated, truncated, info = task.env.step(KEY, state, 1, params)
+    assert_equal(jax.jit(env.step)(KEY, state, 1, params), (*same, terminated | truncated, info))
+    assert truncated == (limit == 1) and env.num_actions == 2
+
+
 @pytest.mark.parametrize("gymnax_id", IDS)
 def test_every_environment_of_gymnax_is_a_task(gymnax_id):
     """By its types; nothing is computed."""

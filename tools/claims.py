@@ -22,6 +22,7 @@ import yaml
 
 from experiments.common.shards import read_rows
 from experiments.common.statistics import difference_interval, mean_interval
+from experiments.common.tables import steps_text
 from sejax.ops.files import write_text
 from tools import remake
 
@@ -40,7 +41,7 @@ HIDDEN = re.compile(
 )
 UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
 FUNCTIONS = {"len": len, "min": min, "max": max, "sum": sum, "round": round, "abs": abs}
-FUNCTIONS |= {each.__name__: each for each in (mean_interval, difference_interval)}
+FUNCTIONS |= {each.__name__: each for each in (mean_interval, difference_interval, steps_text)}
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ PAGE = Path(__file__).parents[1] / "docs/zoo.md"
 def page() -> str:
     """The text of the page."""
     head = PAGE.read_text(encoding="utf-8").partition("\n\n| name |")[0]
-    return f"{head}\n\n{table([row(proxy) for proxy in sejax.pretrained()])}\n"
+    rows = sorted(map(row, sejax.pretrained()), key=lambda x: x["solved by"].startswith("not"))
+    return f"{head}\n\n{table(rows)}\n"
 
 
 def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
@@ -25,15 +26,14 @@ def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
     means: dict[str, float] = {}
     for evaluation in proxy.on_proxy:
         means.setdefault(evaluation.agent, evaluation.return_mean)
-    solving = [agent for agent, mean in means.items() if mean >= solved_reward]
+    marks = [name if mean >= solved_reward else f"not {name}" for name, mean in means.items()]
     assert proxy.learning
     return {
         "name": f"`{proxy.name}`",
-        "learned with": "a policy" if proxy.is_distilled else ", ".join(proxy.scores),
-        "solved by": ", ".join(solving) or "none",
-        "not by": ", ".join(agent for agent in means if agent not in solving),
+        "solved at": f"{solved_reward:g}",
+        "solved by": ", ".join(sorted(marks, key=lambda x: x.startswith("not "))),
         "score": spread([each.return_mean for each in proxy.on_proxy], ".1f"),
-        "real steps": f"{proxy.learning.real_steps:,}",
+        "real steps": f"{proxy.learning.real_steps / 1e6:.1f}M",
     }
 
 

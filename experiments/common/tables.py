@@ -55,6 +55,13 @@ def known_text(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else ""
 
 
+def steps_text(steps: float) -> str:
+    """A number of steps as tables have it, in millions if there are many; - if not known."""
+    if steps < 1e5:
+        return f"{steps:,.0f}"
+    return f"{steps / 1e6:.1f}M" if np.isfinite(steps) else "-"
+
+
 def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
     """Makes `mean ± std [low, high]` of a row with the columns of `mean_columns`."""
 
@@ -96,9 +103,12 @@ def publish(
 ) -> pd.DataFrame:
     """Writes texts as `table.md`, prints and returns them.
 
-    The numbers go to `summary.csv` in the folder `work`, as rows give them again.
+    The title names a folder of its own, as studies of one task differ in it. The numbers go to
+    `summary.csv` in the folder `work`, as rows give them again.
     """
     folder = settings.folder
+    if settings.out and folder.name not in title:
+        title += f": {folder.name}"
     write_text(settings.summary_file, summary.to_csv(index=False))
     rows = [table.columns, ["---"] * len(table.columns), *table.itertuples(index=False)]
     lines = "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)

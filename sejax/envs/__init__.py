@@ -4,8 +4,8 @@
 """
 
 from sejax.envs.base import Task, TaskConfig
-from sejax.envs.environment import with_one_done
 from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.envs.wrappers import with_one_done
 from sejax.options import registry
 
 __all__ = [

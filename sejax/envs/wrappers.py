@@ -1,5 +1,6 @@
 """Environments around another one: actions repeated, partly scored, or all as vectors."""
 
+import copy
 import dataclasses
 from functools import cache, partial
 from typing import Any
@@ -208,3 +209,29 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
         return env
     return AsVectors(env, (observation, action), shape)
+
+
+def with_one_done(env: Any) -> Any:
+    """An environment with the five-value `step` of gymnax before 1.0, which rejax calls.
+
+    It returns `(obs, state, reward, done, info)`; an episode is done where it is terminated or
+    truncated. All else is as before.
+
+    Args:
+      env: an environment of gymnax 1.x, such as an SE, an RN or the `env` of a task.
+
+    Example:
+      >>> task = sejax.envs.make("cartpole")
+      >>> env = with_one_done(task.env)
+      >>> _, state = env.reset(jax.random.key(0))
+      >>> len(env.step(jax.random.key(1), state, 0))
+      5
+    """
+    old = copy.copy(env)
+
+    def step(*args: Any, **named: Any) -> tuple[Array, Any, Array, Array, dict[str, Array]]:
+        obs, state, reward, terminated, truncated, info = env.step(*args, **named)
+        return obs, state, reward, terminated | truncated, info
+
+    vars(old)["step"] = step
+    return old

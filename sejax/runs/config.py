@@ -90,9 +90,10 @@ class CommandConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         for group in ("tracker", "machines"):
-            package = getattr(getattr(self, group, None), "package", None)
+            plugin: Any = getattr(self, group, None)
+            package = getattr(plugin, "package", None)
             if package is not None and importlib.util.find_spec(package) is None:
-                name = registry.name_of(group, getattr(self, group))
+                name = registry.name_of(group, plugin)
                 must = f"{group} must be installed; got {name} without the package"
                 fix = f"Install it with pip install 'sejax[{name}]'"
                 raise ConfigError(f"{must} {package}. {fix}.", group)
