@@ -129,7 +129,9 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        setup = setup_of(config)
+        # What a worker must know: a text, by which it keeps what it has compiled.
+        idle = "tracker", "machines"  # which it need not have
+        setup = json.dumps({name: x for name, x in config.plain().items() if name not in idle})
         with self.pool() as pool:
             yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
 
@@ -306,14 +308,6 @@ def _on_cluster(
 
 
 # --- a worker -------------------------------------------------------------------------------------
-
-
-def setup_of(config: LearnConfig) -> str:
-    """What a worker must know of a run, as JSON: a text, by which it keeps what it has compiled."""
-    plain = config.plain()
-    # A worker need not have what it has no use for.
-    needed = {name: x for name, x in plain.items() if name not in ("tracker", "machines")}
-    return json.dumps(needed)
 
 
 def score(setup: str, share: Portion) -> tuple[Outcome, float]:
