@@ -254,9 +254,7 @@ def make_bilevel(
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )
-    require(
-        not stop_when_solved or bilevel.solved_score is not None,
-        "stop_when_solved",
-        "must be false where no score of this objective, task and mixture says solved; got true.",
-    )
+    can_stop = not stop_when_solved or bilevel.solved_score is not None
+    must = "must be false where no score of this objective, task and mixture says solved; got true."
+    require(can_stop, "stop_when_solved", must)
     return bilevel

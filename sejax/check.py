@@ -124,7 +124,10 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
-    others, myopic = _others(config, task), dict[str, dict[str, AgentConfig]]()
+    names = agents.fitting(task) if config.algorithms is None else config.algorithms
+    same = {registry.name_of("agent", agent) for agent in learned.values()}
+    others = {x: registry.configure("agent", {"name": x}) for x in names if x not in same}
+    myopic = dict[str, dict[str, AgentConfig]]()
     students = learned | others | {"tuned": _tuned(task)}
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
         sighted = {
@@ -132,7 +135,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
         }
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
     config = dataclasses.replace(config, agents=students)
-    on_proxy, on_task = setup_of(config).worlds.values()
+    on_proxy, on_task = setup_of(config)[0].values()
     folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
     settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
@@ -146,18 +149,11 @@ def run(config: CheckConfig) -> dict[str, Any]:
         untrained = dict.fromkeys(learned, TrainingConfig(max_steps=1, max_episodes=1))
         rows[TUNED] = on_task, ["tuned"]
         rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
-        table = _trained(config, task, rows, store)
+        table = _trained(config, rows, store)
         return _told(proxy, null, [*learned], table, folder)
 
 
 # --- who trains where -----------------------------------------------------------------------------
-
-
-def _others(config: CheckConfig, task: Task) -> dict[str, AgentConfig]:
-    """Agents that the proxy was not learned with, by name, with default hyperparameters."""
-    learned = {registry.name_of("agent", agent) for agent in config.agents.values()}
-    names = agents.fitting(task) if config.algorithms is None else config.algorithms
-    return {x: registry.configure("agent", {"name": x}) for x in names if x not in learned}
 
 
 def _tuned(task: Task) -> AgentConfig:
@@ -190,10 +186,10 @@ def _null(
     limits = {key: x.max_steps or 2000 for key, x in on_proxy.trainings.items()}
     trainings = {key: TrainingConfig(max_steps=x, max_episodes=x) for key, x in limits.items()}
     about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
-    return World(env, env.params(weights), trainings), about
+    return World(env, env.params(weights), task, trainings), about
 
 
-def _trained(config: CheckConfig, task: Task, rows: Rows, store: Store) -> pd.DataFrame:
+def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
     """A line for each agent; what is missing is computed, a row at a time, and kept."""
     tables = []
     with config.machines.pool() as pool:
@@ -201,7 +197,7 @@ def _trained(config: CheckConfig, task: Task, rows: Rows, store: Store) -> pd.Da
             names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
             missing = [key for key, name in names.items() if store.get(name) is None]
             print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
-            results = iter(pool(train, [(config, task, world, key) for key in missing]))
+            results = iter(pool(train, [(config, world, key) for key in missing]))
             for key, name in names.items():
                 columns = store.once(name, functools.partial(next, results))
                 tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))

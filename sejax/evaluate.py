@@ -43,25 +43,12 @@ SHOWN = {
 
 
 class World(NamedTuple):
-    """Where agents train, and how long each of them by its key."""
+    """Where agents train, the real task on which they are tested, and how long, by their keys."""
 
     env: Any
     params: Any
-    trainings: dict[str, TrainingConfig]
-
-
-class Setup(NamedTuple):
-    """Where agents train and are tested.
-
-    Attributes:
-      task: the real task, on which all are tested.
-      worlds: by name, the first one first in tables.
-      out_dir: where the files go.
-    """
-
     task: envs.Task
-    worlds: dict[str, World]
-    out_dir: Path
+    trainings: dict[str, TrainingConfig]
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -98,25 +85,30 @@ def evaluate(config: EvaluateConfig) -> float:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
         cannot be written.
     """
-    setup = setup_of(config)
-    out_dir = setup.out_dir
+    worlds, out_dir = setup_of(config)
     require_writable("out_dir", out_dir)  # before agents train for nothing
-    pairs = itertools.product(setup.worlds, config.agents)
-    table = pd.concat([_train_and_test(config, setup, *pair) for pair in pairs])
+    pairs = itertools.product(worlds, config.agents)
+    table = pd.concat([_train_and_test(config, x, worlds[x], key) for x, key in pairs])
     summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
-    (key, *others), task = config.agents, setup.task
+    (key, *others), (name, (*_, task, _)) = config.agents, next(iter(worlds.items()))
     who = "agents of each algorithm" if others else f"{key} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     title = f"{config.num_agents} fresh {who}, tested on {task.name}{solved}"
     print_table(summary, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
-    write_text(out_dir / "evaluation.json", _as_json(summary))
-    first = table[table["world"] == next(iter(setup.worlds))]
-    return float(first["test_return"].mean())
+    text = str(summary.to_json(orient="index", indent=2))
+    if others:  # in each world an object for each of them
+        of_worlds = {world: summary.loc[world].to_json(orient="index") for world in worlds}
+        text = json.dumps({world: json.loads(x) for world, x in of_worlds.items()}, indent=2)
+    write_text(out_dir / "evaluation.json", text)
+    return float(table[table["world"] == name]["test_return"].mean())
 
 
-def setup_of(config: EvaluateConfig) -> Setup:
+def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
     """Where the agents of an evaluation train: on the proxy, and on its real task beside it.
+
+    Returns:
+      The worlds by name, the first one first in tables; and the folder of the files.
 
     Raises:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or agents that
@@ -142,15 +134,15 @@ def setup_of(config: EvaluateConfig) -> Setup:
         trainings[key] = training
     worlds, folder = {}, Path("runs", f"evaluate-{as_file_name(task.name)}")
     if proxy is not None:
-        worlds["the proxy"] = World(proxy.env, proxy.params, trainings)
+        worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings)
         folder = proxy.path.parent
         if folder == header.PRETRAINED_DIR or hub.is_address(config.proxy):
             name = as_file_name(config.proxy.removeprefix(hub.SCHEME))
             folder = Path("runs", f"evaluate-{name}")
     if proxy is None or config.baseline:
         trainings = dict.fromkeys(trainings, real_training)
-        worlds["the real task"] = World(task.env, task.params, trainings)
-    return Setup(task, worlds, Path(config.out_dir or folder))
+        worlds["the real task"] = World(task.env, task.params, task, trainings)
+    return worlds, Path(config.out_dir or folder)
 
 
 def loaded(config: EvaluateConfig) -> Proxy:
@@ -184,22 +176,22 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
 
 
-def _train_and_test(config: EvaluateConfig, setup: Setup, world: str, key: str) -> pd.DataFrame:
+def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -> pd.DataFrame:
     """A row for each agent of an algorithm."""
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
-    print(f"training {config.num_agents:,} {who} on {world} ...", flush=True)
-    columns = train(config, setup.task, setup.worlds[world], key)
-    print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
+    print(f"training {config.num_agents:,} {who} on {name} ...", flush=True)
+    columns = train(config, world, key)
+    print(f"{name}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}
-    return pd.DataFrame({**numbers, **columns, "world": world})
+    return pd.DataFrame({**numbers, **columns, "world": name})
 
 
-def train(config: EvaluateConfig, task: envs.Task, world: World, key: str) -> dict[str, Any]:
+def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
     """What fresh agents reach in a world, arrays `[agent]` by the table's columns."""
-    env, env_params, trainings = world
+    env, env_params, task, trainings = world
     is_varied = config.agent_hparams == "varied"
     agent = agents.make_agent(config.agents[key], task, config.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
@@ -220,15 +212,6 @@ def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
     summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
-
-
-def _as_json(summary: pd.DataFrame) -> str:
-    """An object for each world; with several agents, in it one for each of them."""
-    if summary.index.nlevels == 1:
-        return str(summary.to_json(orient="index", indent=2))
-    worlds = summary.index.unique("world")
-    nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
-    return json.dumps(nested, indent=2)
 
 
 def spread(mean: float, std: float, digits: int) -> str:

@@ -169,10 +169,8 @@ class RewardThreshold(ObjectiveConfig):
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)
             return -(outcome.train_steps + self.unsolved_weight * shortfall)
 
-        meaning = (
-            f"minus the training steps of its agents, and {self.unsolved_weight:g} for each "
-            f"unit of return below {task.solved_reward:g}"
-        )
+        lacking = f"{self.unsolved_weight:g} for each unit of return below {task.solved_reward:g}"
+        meaning = f"minus the training steps of its agents, and {lacking}"
         return Objective(score=score, meaning=meaning)
 
 

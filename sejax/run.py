@@ -47,16 +47,13 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
         lambda config, name: f"{config.resolved_run_dir}_{name}",
         configuration.IN_RUN_DIR,
     )
-    return [of_seed for config in configs for of_seed in runs_of(config)]
-
-
-def runs_of(config: LearnConfig) -> list[LearnConfig]:
-    """The configuration of each seed; where `run_dir` is given, with `seed0` and so on in it."""
-    if config.num_seeds == 1:
-        return [config]
-    seeds, folder = range(config.seed, config.seed + config.num_seeds), config.run_dir
-    folders = {seed: folder and f"{folder}/seed{seed}" for seed in seeds}
-    return [dataclasses.replace(config, seed=x, num_seeds=1, run_dir=folders[x]) for x in seeds]
+    runs: list[LearnConfig] = []
+    for config in configs:
+        for seed in range(config.seed, config.seed + config.num_seeds):
+            is_alone, folder = config.num_seeds == 1, config.run_dir
+            folder = folder if is_alone else folder and f"{folder}/seed{seed}"
+            runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
+    return runs
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -102,11 +99,10 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
         for config, score in zip(configs, scores, strict=True):
             print(f"{score:10.1f}  {config.resolved_run_dir}")
     if diverged:
-        raise FailedError(
-            f"All agents of {', '.join(map(str, diverged))} diverged: nothing was learned. Does "
-            "the task return NaN? If it does not, set a smaller agent.learning_rate. Delete the "
-            "folder, or set another run_dir, to begin anew."
-        )
+        what = f"All agents of {', '.join(map(str, diverged))} diverged: nothing was learned."
+        fix = "Does the task return NaN? If it does not, set a smaller agent.learning_rate."
+        anew = "Delete the folder, or set another run_dir, to begin anew."
+        raise FailedError(f"{what} {fix} {anew}")
     return scores
 
 

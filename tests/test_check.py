@@ -26,8 +26,7 @@ def save(path, *words):
     config = sejax.config(words)
     env = config.parts()["proxy"]
     record = {"learning": {"command": "a test", "generations": 1, "real_steps": 1000}}
-    plain = config.plain()
-    sejax.save(path, env, env.init_weights(np.uint32([0, 3])), plain, 0.8, **record)
+    sejax.save(path, env, env.init_weights(np.uint32([0, 3])), config.plain(), 0.8, **record)
     return path
 
 

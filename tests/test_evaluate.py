@@ -119,16 +119,16 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     words = ("agents=[ddqn,ppo]", "agents.ddqn.warmup_episodes=2", "agents.ppo.rollout_steps=100",
              "proxy.hidden_size=4", "training.max_steps=4000", *SE[3:])  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    setup = setup_of(evaluate_config(
+    worlds, _ = setup_of(evaluate_config(
         f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]", "agents.dueling_ddqn.warmup_episodes=10",
         "agents.ppo.rollout_steps=null"))  # fmt: skip
-    budgets = {key: x.max_steps for key, x in setup.worlds["the proxy"].trainings.items()}
+    budgets = {key: x.max_steps for key, x in worlds["the proxy"].trainings.items()}
     # Learned with 4000 steps, of which DDQN waits 2 * 200; others wait 10 episodes.
     waits = {"ddqn": 2 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
-    assert setup_of(as_learned).worlds["the proxy"].trainings["ppo"].max_steps == 4000
+    assert setup_of(as_learned)[0]["the proxy"].trainings["ppo"].max_steps == 4000
     assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
@@ -160,7 +160,7 @@ def test_what_cannot_be_trained_is_refused_before_anything_starts(
 def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(word, expected, tmp_path):
     """They do not bootstrap there; on the real task beside the RN they do likewise; words win."""
     path = save(tmp_path / "proxy.safetensors", "env=mountain_car_continuous", "proxy=rn")
-    for world in setup_of(evaluate_config(f"proxy={path}", word)).worlds.values():
+    for world in setup_of(evaluate_config(f"proxy={path}", word))[0].values():
         assert world.trainings["td3"].time_limit_is_terminal == expected
 
 
@@ -171,8 +171,7 @@ def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, 
     words = f"proxy={bare}", "agent=q_learning", "baseline=false"
     assert refused(setup_of, evaluate_config(*words)) == "training_from"
     given = "training_from=config", "training.max_steps=7", "training.stop_rule=never"
-    setup = setup_of(evaluate_config(*words, *given))
-    ((name, world),) = setup.worlds.items()
+    ((name, world),) = setup_of(evaluate_config(*words, *given))[0].items()
     assert name == "the proxy" and world.trainings["q_learning"].max_steps == 7
 
 
@@ -181,10 +180,10 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     words = "env=cliff_walking", "proxy=rn", "exploration=count_based"
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
-    setup, learner = setup_of(config), learned(*words)[0]
+    (worlds, _), learner = setup_of(config), learned(*words)[0]
     assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
-    assert setup.worlds["the proxy"].trainings == {"q_learning": config.real_training}
+    assert worlds["the proxy"].trainings == {"q_learning": config.real_training}
 
 
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):

@@ -202,5 +202,6 @@ def test_what_cannot_be_read_or_written_is_one_message(the_hub, monkeypatch):
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     sejax.push("cartpole", "me/se")
-    study = setup_of(evaluate_config(["proxy=hf://me/se@0"]))
-    assert study.task.name == "cartpole" and str(study.out_dir) == "runs/evaluate-me_se_0"
+    worlds, out_dir = setup_of(evaluate_config(["proxy=hf://me/se@0"]))
+    assert str(out_dir) == "runs/evaluate-me_se_0"
+    assert {world.task.name for world in worlds.values()} == {"cartpole"}

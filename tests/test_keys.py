@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.ops.keys import step_keys, words
+from sejax.ops.keys import step_keys
 
 NUM_STEPS, NUM_PURPOSES = 20_000, 6  # those of the trainer
 LOOPS = (0, 1, 2**31 - 1)  # seeds
@@ -14,9 +14,8 @@ LOOPS = (0, 1, 2**31 - 1)  # seeds
 @jax.jit
 def of_steps(key, steps):
     """Words of a loop's steps and purposes, `[step, purpose, 2]`."""
-    return jax.vmap(lambda step: jnp.stack(list(map(words, step_keys(key, step, NUM_PURPOSES)))))(
-        steps
-    )
+    keys = jax.vmap(lambda step: jnp.stack(step_keys(key, step, NUM_PURPOSES)))(steps)
+    return jax.random.key_data(keys)
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +88,8 @@ def test_keys_have_the_implementation_of_the_loops(impl):
     assert str(jax.random.key_impl(keys)) == impl
     data = np.asarray(jax.random.key_data(keys))
     assert len(np.unique(data, axis=0)) == 1500
-    assert data.shape[1] == words(keys[0]).size == (2 if impl == "threefry2x32" else 4)
+    assert (
+        data.shape[1] == jax.random.key_data(keys[0]).size == (2 if impl == "threefry2x32" else 4)
+    )
     uniform = jax.jit(jax.vmap(jax.random.uniform))(keys)
     assert abs(float(uniform.mean()) - 0.5) < 5 / np.sqrt(12 * 1500)

@@ -92,16 +92,11 @@ AGENT = np.array([0, 1] * 6)
 def plain_comparable(scores, agent, incumbents):
     """The same in plain Python, one candidate at a time."""
     out = []
-    for score, own_index in zip(scores, agent, strict=True):
-        own = [float(s) for s, f in zip(scores, agent, strict=True) if f == own_index]
-        alive = [s for s in own if np.isfinite(s)]
-        incumbent = incumbents[own_index]
-        if not np.isfinite(incumbent):
-            incumbent = sum(alive) / len(alive) if alive else NAN
-        if not np.isfinite(score):
-            out.append(NAN)
-        else:
-            out.append(float(score) - incumbent)
+    for score, index in zip(scores.tolist(), agent, strict=True):
+        of_agent = scores[agent == index].tolist()
+        alive = [x for x in of_agent if np.isfinite(x)]
+        mean = incumbents[index] if np.isfinite(incumbents[index]) else sum(alive) / len(alive)
+        out.append(score - mean if np.isfinite(score) else NAN)
     return out
 
 

@@ -48,9 +48,9 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
         assert learning.cpu_s > 0 and learning.train_steps > learning.agents
         assert learning.generations >= proxy.generation
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    study = setup_of(evaluate_config(words.split()))
+    worlds, _ = setup_of(evaluate_config(words.split()))
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean)
-    assert best.agent in study.worlds["the proxy"].trainings, "the command trains what did best"
+    assert best.agent in worlds["the proxy"].trainings, "the command trains what did best"
 
 
 @pytest.mark.parametrize("name", PROXIES)

@@ -1,6 +1,8 @@
 """`python -m sejax.run` as a user meets it: files, resume, kills, damage, bad input."""
 
+import contextlib
 import functools
+import io
 import json
 import os
 import re
@@ -34,27 +36,16 @@ START = functools.partial(commands.start, run.main, run.help_text, run.configs_o
 @functools.cache
 def chunks(*words):
     """The compiled program of a configuration, which all runs of it share."""
-    return workers.make_chunks(sejax.config([*TINY, *words]))
+    return workers.make_chunks(sejax.config(words))
 
 
-class Report(RunProgress):
-    """Keeps the messages."""
-
-    def __init__(self, config):
-        self.said = []
-        super().__init__(config)
-
-    def say(self, text):
-        self.said.append(text)
-
-
-def learn(path, *words, program=()):
+def learn(path, *words, program=(), base=TINY):
     """A session of a run, as `sejax.run` has it; returns its messages."""
-    config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
-    report = Report(config)
-    with run_directory.RunDirectory(config) as directory:
-        session.run(config, directory, chunks(*program), report)
-    return "\n".join(report.said)
+    config = sejax.config([*base, *program, *words, f"run_dir={path}"])
+    directory, said = run_directory.RunDirectory(config), io.StringIO()
+    with directory, contextlib.redirect_stdout(said):
+        session.run(config, directory, chunks(*base, *program), RunProgress(config))
+    return said.getvalue()
 
 
 def assert_same(folder, other):
@@ -194,23 +185,13 @@ def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path
 FAMILIES = ("agents=[sarsa,q_learning]",)
 
 
-@functools.cache
-def family_chunks():
-    return workers.make_chunks(sejax.config([*OWN, *FAMILIES]))
-
-
-def learn_families(path, *words):
-    """A session of a run with two families; returns the line that is printed of its last chunk."""
-    config = sejax.config([*OWN, *words, f"run_dir={path}"])
-    report = RunProgress(config)
-    with run_directory.RunDirectory(config) as directory:
-        session.run(config, directory, family_chunks(), report)
+learn_families = functools.partial(learn, program=FAMILIES, base=OWN)
 
 
 @pytest.fixture(scope="module")
 def two_families(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("families")
-    learn_families(path, *FAMILIES, "generations=5")
+    learn_families(path, "generations=5")
     return path
 
 
@@ -232,13 +213,11 @@ def test_metrics_and_proxies_tell_of_each_family(two_families):
         assert record["scores"] == scores
 
 
-def test_a_run_of_families_goes_on_whichever_way_they_are_named(two_families, tmp_path, capsys):
-    learn_families(tmp_path, *FAMILIES, "generations=2")
-    assert re.search(
-        r"search mean \S+ ± \S+ \(q_learning \S+, sarsa \S+\), best", capsys.readouterr().out
-    )
-    learn_families(tmp_path, "agents=[q_learning,sarsa]", "generations=5")
-    assert "Resuming at generation 2" in capsys.readouterr().out
+def test_a_run_of_families_goes_on_whichever_way_they_are_named(two_families, tmp_path):
+    said = learn_families(tmp_path, "generations=2")
+    assert re.search(r"search mean \S+ ± \S+ \(q_learning \S+, sarsa \S+\), best", said)
+    said = learn_families(tmp_path, "agents=[q_learning,sarsa]", "generations=5")
+    assert "Resuming at generation 2" in said
     assert_same(tmp_path, two_families)
     assert is_drawn(tmp_path / "learning_curve.png")
 

@@ -150,19 +150,6 @@ def test_a_drawn_end_comes_as_often_as_the_done_output_says():
         assert share == probability if error == 0 else abs(share - probability) < 5 * error
 
 
-def test_an_agent_sees_a_drawn_end_as_it_sees_any_other():
-    env = make_env(done="bernoulli")
-    params = env.params(constant_heads(env, state=0.7, reward=1.5, done=0.4))
-    _, state = env.reset_env(jax.random.key(0), params)
-    step = jax.jit(jax.vmap(env.step_env, (0, None, None, None)))
-    keys = jax.random.split(jax.random.key(1), 50)
-    obs, _, reward, terminated, info = step(keys, state, 1, params)
-    assert 0 < np.sum(terminated) < 50 and not info["nonfinite"].any()
-    np.testing.assert_array_equal(info["discount"], 1.0 - terminated)
-    np.testing.assert_allclose(obs, 0.7)  # the state after an end is the predicted one
-    np.testing.assert_array_equal(reward, 1.5)
-
-
 # --- learned beginnings --------------------------------------------------------------------------
 
 

@@ -59,9 +59,9 @@ def test_an_update_equals_sejaxs_on_the_same_noise_and_scores(changes, scores):
         signed[[0, 5, 7]] = np.nan, np.nan, np.inf
     strategy = config.make(NUM_DIMS)
     state = strategy.init(jax.random.key(0), psi)
-    members = jnp.concatenate([psi + noise, psi - noise])
-    moved = strategy.tell(jax.random.key(0), members, jnp.float32(signed),
-                          jnp.float32(incumbent.mean()), state)  # fmt: skip
+    members = jax.numpy.concatenate([psi + noise, psi - noise])
+    moved = strategy.tell(jax.random.key(0), members, jax.numpy.float32(signed),
+                          jax.numpy.float32(incumbent.mean()), state)  # fmt: skip
     got = torch_nes.nes_update(psi, noise, np.concatenate([signed, incumbent]), config)
     np.testing.assert_allclose(got, strategy.incumbent(moved), rtol=1e-4, atol=1e-5)
     assert (got != psi).any() == (scores != "none better" or config.weight_decay > 0)

@@ -105,12 +105,12 @@ def require_fit(
       ConfigError: if it cannot.
     """
     if not _fits(agent, spec):
-        known = fitting(spec)
-        must = f"{field} must be one of {', '.join(known)} in {task_name}, with {spec.states} "
-        must += (
-            f"states and {spec.actions} actions; got {shortened(registry.name_of('agent', agent))}"
+        known, got = fitting(spec), shortened(registry.name_of("agent", agent))
+        must = (
+            f"{field} must be one of {', '.join(known)} in {task_name}, with {spec.states} states"
         )
-        raise ConfigError(f"{must}. Set agent={known[0]}.", field)
+        message = f"{must} and {spec.actions} actions; got {got}. Set agent={known[0]}."
+        raise ConfigError(message, field)
     if exploration.states is not None and agent.states not in (None, exploration.states):
         agent_name = shortened(registry.name_of("agent", agent))
         exploration_name = shortened(registry.name_of("exploration", exploration))

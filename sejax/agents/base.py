@@ -108,10 +108,8 @@ class Agent:
     varied: "Varied | None" = None
 
     def __reduce__(self) -> NoReturn:
-        raise TypeError(
-            "An agent holds functions and cannot be pickled. Send its configuration to the other "
-            "process, and call sejax.make_agent there."
-        )
+        fix = "Send its configuration to the other process, and call sejax.make_agent there."
+        raise TypeError(f"An agent holds functions and cannot be pickled. {fix}")
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.

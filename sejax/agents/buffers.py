@@ -13,7 +13,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
-from sejax.ops.keys import murmur, words
+from sejax.ops.keys import murmur
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
 T = TypeVar("T")
@@ -111,7 +111,7 @@ def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
                 rows, step, pack(transition), active
             ),
             batch=lambda key, rows, num_steps, transition, in_use: sample(
-                rows, words(key)[0], num_steps, batch_size, action_dim, in_use
+                rows, jax.random.key_data(key)[0], num_steps, batch_size, action_dim, in_use
             ),
         )
 

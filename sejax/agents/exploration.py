@@ -146,16 +146,13 @@ class ForwardModel(nn.Module):
     ) -> Float[Array, "feature *batch"]:
         config = self.config
 
-        def with_action(x: Array) -> Array:
-            return jnp.concatenate([x, action])
-
         def mlp(num_layers: int) -> MLP:
             return MLP(config.feature_dim, config.hidden_size, num_layers, "leaky_relu")
 
-        x = mlp(config.num_layers)(with_action(features))
+        x = mlp(config.num_layers)(jnp.concatenate([features, action]))
         for _ in range(config.num_residual_blocks):
-            hidden = nn.leaky_relu(Dense(config.feature_dim)(with_action(x)))
-            x = x + Dense(config.feature_dim)(with_action(hidden))
+            hidden = nn.leaky_relu(Dense(config.feature_dim)(jnp.concatenate([x, action])))
+            x = x + Dense(config.feature_dim)(jnp.concatenate([hidden, action]))
         return mlp(1)(x)
 
 

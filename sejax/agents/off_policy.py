@@ -60,12 +60,9 @@ class OffPolicyOptions(AgentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.batch_size <= self.buffer_size,
-            "agent.batch_size",
-            f"must be at most agent.buffer_size={self.buffer_size}; got {self.batch_size}. Set "
-            f"agent.batch_size={self.buffer_size}.",
-        )
+        field, most = "agent.batch_size", self.buffer_size
+        got = f"got {self.batch_size}. Set {field}={most}."
+        require(self.batch_size <= most, field, f"must be at most agent.buffer_size={most}; {got}")
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""

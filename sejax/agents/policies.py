@@ -1,9 +1,8 @@
 """How actions come of their values."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
-
-from sejax.ops.keys import words
 
 
 def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
@@ -33,7 +32,7 @@ def epsilon_greedy(
 
     The key's own words decide; it must not be used for anything else.
     """
-    bits = words(key)
+    bits = jax.random.key_data(key)
     random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
     uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
     return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))

@@ -64,12 +64,8 @@ class SACConfig(ActorCriticOptions):
         kinds = ("target_entropy", "target_entropy_fraction")
         used, unused = kinds if task.num_actions is None else kinds[::-1]
         got, default = (getattr(config, unused) for config in (self, type(self)))
-        require(
-            got == default,
-            f"agent.{unused}",
-            f"must stay {default} with {task.name}'s actions; got {shortened(got)}. Set "
-            f"agent.{used} in its place.",
-        )
+        message = f"must stay {default} with {task.name}'s actions; got {shortened(got)}."
+        require(got == default, f"agent.{unused}", f"{message} Set agent.{used} in its place.")
         if task.num_actions is None:
             return SAC(self, task.obs_dim, task.action_dim, task.max_action).agent()
         return DiscreteSAC(self, task.obs_dim, task.num_actions).agent()

@@ -106,27 +106,19 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     agent = make(config)
     variants = [agent]
     if "hidden_size" in ranges:
-        low, high = int(ranges["num_layers"].low), int(ranges["num_layers"].high)
-        shapes = [
-            (depth, size)
-            for depth in range(low, high + 1)
-            for size in hidden_sizes(ranges["hidden_size"], depth)
-        ]
+        depths = range(int(ranges["num_layers"].low), int(ranges["num_layers"].high) + 1)
+        sizes = {depth: hidden_sizes(ranges["hidden_size"], depth) for depth in depths}
+        shapes = [(depth, size) for depth in depths for size in sizes[depth]]
         room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
-        variants = [
-            make(dataclasses.replace(config, **room, **{"num_layers": depth, "hidden_size": size}))
-            for depth, size in shapes
-        ]
+        changes = [room | {"num_layers": depth, "hidden_size": size} for depth, size in shapes]
+        variants = [make(dataclasses.replace(config, **change)) for change in changes]
 
     def draw(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
-        keys = jax.random.split(key, len(ranges))
-        values = {
-            name: draw_value(k, bounds)
-            for k, (name, bounds) in zip(keys, ranges.items(), strict=True)
-        }
+        drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())
+        values = dict(zip(ranges, drawn, strict=True))
         traced = {name: x for name, x in values.items() if name != "num_layers"}
         hparams = with_hparams(variants[0].hparams, traced)
-        depth, units = values.get("num_layers"), values.get("hidden_size")
+        depth, units = (values.get(x, jnp.zeros(())) for x in ("num_layers", "hidden_size"))
         too_small = [(x < depth) | ((x == depth) & (size < units)) for x, size in shapes]
         return jnp.int32(sum(too_small)), hparams, values  # the smallest that has room
 

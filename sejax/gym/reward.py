@@ -63,13 +63,17 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         discount = as_python(header.discount if discount is None else discount)
         fraction()("discount", discount, header.discount)
         self.discount = float(discount)
-        self._info_keys = self._keys(header)
+        weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()
+        if weighs_info or self.config.augmented:  # of which the task's configuration tells
+            spec = envs.spec_of(configured("env", header.config["env"], header.task))
+            keys = spec.info_keys if weighs_info else spec.augmented_keys
+        self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
         _require_task(env, header)
         num_inputs = flatdim(env.observation_space)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
         shapes = networks.shapes_of({"potential": [num_inputs + num_keys, *hidden, 1]})
-        if self.config.shaping.weighs_info:
+        if weighs_info:
             shapes = {"info_weights": (num_keys,)}
         check_tensors("weights", weights, shapes, "those of the environment's task")
         self._weights = weights.get("info_weights")  # [info_keys]
@@ -123,15 +127,6 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         before, self._potential = self._potential, self.potential(obs, info_values)
         after = 0.0 if terminated and self.config.zero_at_terminal else self._potential
         return self.discount * after - before if self.config.shaping.is_potential_based else after
-
-    def _keys(self, header: Header) -> list[str]:
-        """Entries of `info` that the RN needs, of which the configuration of its task tells."""
-        weighs_info = self.config.shaping.weighs_info
-        if not (weighs_info or self.config.augmented):
-            return []
-        spec = envs.spec_of(configured("env", header.config["env"], header.task))
-        keys = spec.info_keys if weighs_info else spec.augmented_keys
-        return [GYMNASIUM_NAMES.get(key, key) for key in keys]
 
 
 def _require_task(env: Env, header: Header) -> None:

@@ -26,8 +26,9 @@ def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
       num: how many (static).
 
     Returns:
-      Keys of the same implementation. For threefry, with its two words, two keys of a loop
-      coincide by chance alone, with probability 2**-64 for a pair.
+      Keys of the same implementation, whose data are random bits themselves. For threefry, with
+      its two words, two keys of a loop coincide by chance alone, with probability 2**-64 for a
+      pair.
 
     Example:
       >>> a, b = step_keys(jax.random.key(0), jnp.int32(7), 2)
@@ -45,14 +46,6 @@ def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
     hashed = _mix(jnp.where(is_low, low, high) + count)
     keys = jax.random.wrap_key_data(hashed.reshape(num, size), impl=jax.random.key_impl(key))
     return tuple(keys[i] for i in range(num))
-
-
-def words(key: Array) -> UInt32[Array, " words"]:
-    """The words of a step's key, which are random bits themselves.
-
-    There are two, or more where `jax.random`'s implementation has longer keys.
-    """
-    return jax.random.key_data(key)
 
 
 def murmur(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:

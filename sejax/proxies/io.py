@@ -79,10 +79,8 @@ class _Loaded:
           >>> list(load_proxy("cliff_walking-rn").learned_agents())
           ['q_learning']
         """
-        return {
-            key: header.configured("agent", values, self.path.name)
-            for key, values in agents_of(self.config).items()
-        }
+        stored, where = agents_of(self.config).items(), self.path.name
+        return {key: header.configured("agent", values, where) for key, values in stored}
 
 
 @dataclass(frozen=True, kw_only=True)

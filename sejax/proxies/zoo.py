@@ -18,7 +18,6 @@ from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
 CARD = Path(__file__).with_name("card.md")
-_GYM = "env = sejax.gym.make({})  # a gymnasium.Env, in NumPy: any agent\n"
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
 
 
@@ -136,8 +135,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     """
     path, _, learned = stored
     record, config = learned.proxies[0], learned.config
-    names = [name for name in fields_of(PretrainedProxy) if record.get(name) is not None]
-    values = {name: record[name] for name in names}
+    values = {x: record[x] for x in fields_of(PretrainedProxy) if record.get(x) is not None}
     if "score" in record:
         scores = dict.fromkeys(header.agents_of(config), float(record["score"]))
         values.setdefault("scores", scores)
@@ -178,6 +176,7 @@ def card_of(
     kind = proxy.kind if proxy.kind in _KINDS else "other"
     call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
+    gym = f"env = sejax.gym.make({call})  # a gymnasium.Env, in NumPy: any agent\n"
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     if best and best.hparams != "as_learned":
         words += f" agent={best.agent}"
@@ -196,7 +195,7 @@ def card_of(
         "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
         "command": proxy.learning and proxy.learning.command,
         "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
-        "gym": _GYM.format(call) if kind == "se" else "",
+        "gym": gym if kind == "se" else "",
         "call": call,
         "source": source,
         "overrides": words,

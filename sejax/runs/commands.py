@@ -41,7 +41,13 @@ def start(
     with messages():
         options = [*HELP, *([PRINT_CONFIG] if configs_of else [])]
         overrides = [word for word in words if word not in options]
-        _prepare(overrides)
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
+        if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
+            sys.path.insert(0, "")
+        Path.cwd()
+        runtime.configure_xla(_devices(overrides))  # before a plugin starts jax's devices
         if {*HELP} & {*words}:
             print(help_text(overrides))
         elif configs_of and PRINT_CONFIG in words:
@@ -58,17 +64,6 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
     again.daemon = True
     again.start()
     raise KeyboardInterrupt(128 + number)
-
-
-def _prepare(overrides: Sequence[str]) -> None:
-    """Sets the process up."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
-    if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
-        sys.path.insert(0, "")
-    Path.cwd()
-    runtime.configure_xla(_devices(overrides))  # before a plugin starts jax's devices
 
 
 def _devices(overrides: Sequence[str]) -> int | None:

@@ -65,11 +65,8 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
     for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
-            got, field = shortened(override), "an override"
-            message = (
-                f"{field} must read FIELD=VALUE; got {got}. Write {suggestion(overrides[i:])}."
-            )
-            raise ConfigError(message, field)
+            got = f"got {shortened(override)}. Write {suggestion(overrides[i:])}."
+            raise ConfigError(f"an override must read FIELD=VALUE; {got}", "an override")
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
         fix = shortened(f"{text.rstrip(',')}]" if is_open else first)

@@ -42,7 +42,6 @@ TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
 IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
-JOINT = "+"  # between several agents, in names
 FIX = "Set agents=[ddqn,ppo]."
 Schema = TypeVar("Schema", bound="CommandConfig")
 
@@ -212,7 +211,7 @@ class LearnConfig(CommandConfig):
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
         if group == "agent":
-            return JOINT.join(self.agents)
+            return "+".join(self.agents)
         return registry.name_of(group, getattr(self, group))
 
     def task(self) -> envs.Task:

@@ -57,12 +57,20 @@ class RunProgress:
         path, solved_score = directory.path, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
         verdict = f"best search mean {best:.1f}"
-        if bilevel.scoring.objective.meaning:
-            verdict += f": {bilevel.scoring.objective.meaning}"
         if solved_score is not None:
-            verdict = "solved" if is_solved else "not solved"
-            verdict += f": best search mean {best:.1f}, solved at {solved_score:g}"
+            is_not = "" if is_solved else "not "
+            verdict = f"{is_not}solved: {verdict}, solved at {solved_score:g}"
+        elif bilevel.scoring.objective.meaning:
+            verdict += f": {bilevel.scoring.objective.meaning}"
         ending = "solved" if is_solved else "learned"
+        # What names plugins is typed: no name in a file is imported.
+        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
+        env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
+        named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
+        words = "".join(f" {name}={text}" for name, text in named.items() if ":" in text)
+        fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
+        arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
+        arguments += f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else ""
         self.say(
             f"\n{bilevel.proxy.task.name}: {ending}\n"
             f"{verdict}\n\n"
@@ -70,21 +78,7 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             "Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate proxy={path}{self._plugin_words()} num_agents=20\n"
+            f"  python -m sejax.evaluate proxy={path}{words} num_agents=20\n"
             "Use it as a gymnax environment:\n"
-            f'  env, params = sejax.load("{path}"{self._plugin_arguments()})'
+            f'  env, params = sejax.load("{path}"{arguments})'
         )
-
-    def _plugin_words(self) -> str:
-        """The overrides that name plugins, as `sejax.evaluate` imports only what is typed."""
-        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
-        env, proxy = self._config.name("env"), self._config.name("proxy")
-        words = {"env": env, "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
-        return "".join(f" {name}={text}" for name, text in words.items() if ":" in text)
-
-    def _plugin_arguments(self) -> str:
-        """The arguments of `sejax.load` for plugins, as no name in a file is imported."""
-        env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
-        fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
-        task = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
-        return task + (f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else "")

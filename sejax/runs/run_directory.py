@@ -30,8 +30,8 @@ COLUMNS = (
 # Columns that each agent of a mixture has too, with its name at the end.
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
 # Fields and groups that may change between two sessions: how long a run is, how it is computed.
-LENGTH_FIELDS = {"generations", "stop_when_solved", "checkpoint_every"}
-FREE_FIELDS = LENGTH_FIELDS | {"devices", "run_dir", "tracker", "machines"}
+FREE_FIELDS = {"generations", "stop_when_solved", "checkpoint_every"}
+FREE_FIELDS |= {"devices", "run_dir", "tracker", "machines"}
 
 _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # of the checkpoint's tensors

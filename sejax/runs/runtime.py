@@ -85,19 +85,15 @@ def configure_jax() -> None:
     root = files.cache_folder()
     if root is None or jax.config.jax_compilation_cache_dir:
         return
-    jax.config.update("jax_compilation_cache_dir", str(root / cpu_fingerprint()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def cpu_fingerprint() -> str:
-    """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
     lines = [platform.processor()]
     with contextlib.suppress(OSError):
         of_cores = Path("/proc/cpuinfo").read_text().splitlines()
         fields = ("model name", "flags", "Features")
         lines = sorted({x for x in of_cores if x.startswith(fields)}) or lines
     digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
-    return f"{platform.machine()}-{digest}"
+    folder = str(root / f"{platform.machine()}-{digest}")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def versions() -> dict[str, str]:

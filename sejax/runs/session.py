@@ -60,8 +60,10 @@ def run(
     tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
     guarded = GuardedTracker(config.tracker, tracked, report.say)
     with contextlib.closing(guarded) as tracker:
-        while (ended := _ended(config, directory, bilevel, state)) is None:
+        while not (state.solved or _all_diverged(directory, bilevel)):
             first = len(directory.rows)
+            if first >= config.generations:
+                break
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
@@ -77,11 +79,12 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
+    ended = "diverged" if _all_diverged(directory, bilevel) else "finished"
     generations, agents = len(directory.rows), bilevel.strategy.num_evaluations
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
-        "ended": ended,
+        "ended": "solved" if state.solved else ended,
         "best_score": float(state.best_score),
         "solved_score": bilevel.solved_score,
         "wall_s": round(start_wall_s + time.monotonic(), 1),
@@ -113,17 +116,6 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgre
         save_proxies(directory, chunks.bilevel, jax.device_get(state), 0)
     # Buffers of its own, so that they can be donated.
     return jax.tree.map(lambda x: x.copy(), state)
-
-
-def _ended(
-    config: LearnConfig, directory: RunDirectory, bilevel: Bilevel, state: LearnState
-) -> str | None:
-    """How the run has ended; None if it has not."""
-    if state.solved:
-        return "solved"
-    if _all_diverged(directory, bilevel):
-        return "diverged"
-    return "finished" if len(directory.rows) >= config.generations else None
 
 
 def _advance(

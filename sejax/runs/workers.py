@@ -129,7 +129,9 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        setup = setup_of(config)
+        # What a worker must know: a text, by which it keeps what it has compiled.
+        idle = "tracker", "machines"  # which it need not have
+        setup = json.dumps({name: x for name, x in config.plain().items() if name not in idle})
         with self.pool() as pool:
             yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
 
@@ -270,10 +272,9 @@ def num_workers(machines: RayConfig) -> int:
 
     here = ray.get_runtime_context().get_node_id()
     if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
-        raise FailedError(
-            "Ray has ended on this machine, so that no training can be sent out. The generations "
-            "before are saved; start Ray and repeat the command to resume."
-        )
+        fix = "The generations before are saved; start Ray and repeat the command to resume."
+        message = f"Ray has ended on this machine, so that no training can be sent out. {fix}"
+        raise FailedError(message)
     return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
@@ -300,22 +301,13 @@ def _on_cluster(
         results: list[Any] = ray.get(tasks)
     except ray.exceptions.RayError as error:  # its last line is what the worker raised
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
-        raise FailedError(
-            f"A worker has failed: {reason}. What was finished before is saved; the same command "
-            f"with machines=local resumes here."
-        ) from error
+        fix = "the same command with machines=local resumes here."
+        message = f"A worker has failed: {reason}. What was finished before is saved; {fix}"
+        raise FailedError(message) from error
     return results
 
 
 # --- a worker -------------------------------------------------------------------------------------
-
-
-def setup_of(config: LearnConfig) -> str:
-    """What a worker must know of a run, as JSON: a text, by which it keeps what it has compiled."""
-    plain = config.plain()
-    # A worker need not have what it has no use for.
-    needed = {name: x for name, x in plain.items() if name not in ("tracker", "machines")}
-    return json.dumps(needed)
 
 
 def score(setup: str, share: Portion) -> tuple[Outcome, float]:
