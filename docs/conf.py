@@ -74,7 +74,8 @@ nitpick_ignore_regex = [
     ),
     (
         "py:class",
-        r"sejax\.(options\.registry\.(T|Makes|RunConfig)|scoring\.Scoring|ops\.networks\.MLP)",
+        r"sejax\.(options\.(T|registry\.(T|Makes|RunConfig))|scoring\.Scoring|evaluation\.Tests"
+        r"|ops\.networks\.MLP)",
     ),
 ]
 

@@ -205,9 +205,10 @@ def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Mean and standard deviation of each column for each group.
 
-    A test return that is not a number counts as the worst of all.
+    An agent that diverged counts as the worst of all.
     """
-    table = table.fillna({"test_return": table["test_return"].min()})
+    returns = table["test_return"].mask(table["nonfinite"] > 0)
+    table = table.assign(test_return=returns.fillna(returns.min()))
     grouped = table.groupby(by, sort=False)
     summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
     summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
