@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.parametrize("proxy", PROXIES.values(), ids=list(PROXIES))
 def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
     learning, name = proxy.learning, proxy.name
-    assert proxy.is_distilled or proxy.scores
+    assert proxy.policy_return is not None or proxy.scores
     assert all(map(math.isfinite, proxy.scores.values()))
     assert proxy.on_proxy and all(x.num_agents >= 10 for x in proxy.on_proxy)
     counts = [learning.generations, learning.real_steps]
@@ -57,7 +57,7 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
 def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     proxy, stored = PROXIES[name], sejax.load_proxy(name)
     words = shlex.split(proxy.learning.command)[3:]
-    if proxy.is_distilled:
+    if proxy.policy_return is not None:
         own, config = read(words)
         assert own.search.generations == proxy.learning.generations
         assert [x.agent for x in proxy.on_proxy] == list(stored.learned_agents())
@@ -67,11 +67,11 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     assert config.env == registry.configure("env", stored.config["env"])
     agents = stored.learned_agents()
     first = agents[next(iter(agents))].discount  # of a policy there is none
-    assert stored.discount == (1.0 if proxy.is_distilled else first)
+    assert stored.discount == (1.0 if proxy.policy_return is not None else first)
     assert all(stored.learned_with(group) for group in ("exploration", "es", "objective"))
     if proxy.kind == "se":
         assert config.training == sejax.training_of(stored)
-    if proxy.kind == "se" and not proxy.is_distilled:
+    if proxy.kind == "se" and not proxy.policy_return is not None:
         assert config.proxy == stored.env.config and config.es == stored.learned_with("es")
 
 

@@ -97,11 +97,6 @@ class PretrainedProxy:
     policy_return: float | None = None
 
     @property
-    def is_distilled(self) -> bool:
-        """Whether it was made of a policy, and no agent was trained to learn it."""
-        return self.policy_return is not None
-
-    @property
     def on_proxy(self) -> tuple[Evaluation, ...]:
         """The evaluations of agents that trained on it, and not on the real task."""
         return tuple(x for x in self.evaluations if x.world == "proxy")
