@@ -227,7 +227,12 @@ def _told(
     solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     summary = summarise(table, ["world"])
     steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
-    if cost := _cost(proxy.path):  # never, where its agents do not reach the solved score
+    learning = zoo.describe(header.read(proxy.path)).learning
+    run: dict[str, Any] = vars(learning) if learning else {}  # of the file, or beside it
+    with contextlib.suppress(OSError, ValueError):
+        run = run or json.loads(proxy.path.with_name("run.json").read_text())
+    cost: dict[str, Any] = {name: run[name] for name in ("real_steps", "cpu_s") if name in run}
+    if cost:  # never, where its agents do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())
@@ -240,15 +245,6 @@ def _told(
     write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")
     plots.check(table, task.solved_reward, folder / "check.png", f"{proxy.path.stem}: {verdict}")
     return found
-
-
-def _cost(path: Path) -> dict[str, Any]:
-    """Real steps and CPU seconds of learning, of the file or of `run.json` beside it."""
-    learning = zoo.describe(header.read(path)).learning
-    summary: dict[str, Any] = vars(learning) if learning else {}
-    with contextlib.suppress(OSError, ValueError):
-        summary = summary or json.loads(path.with_name("run.json").read_text())
-    return {name: summary[name] for name in ("real_steps", "cpu_s") if name in summary}
 
 
 if __name__ == "__main__":

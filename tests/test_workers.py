@@ -1,5 +1,6 @@
 """Trainings that workers compute: the numbers of a single process, without Ray."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from sejax.runs.workers import Chunks, RemoteChunks
 def require_equal_numbers(words, generations):
     """Runs generations in one program, and in shares, of which the last one comes first."""
     config = sejax.config(words)
-    setup = workers.setup_of(config)
+    setup = json.dumps(config.plain())
     sizes = []
 
     def compute(shares):
@@ -72,8 +73,8 @@ def make_room():
 
 
 def test_a_worker_imports_the_plugins_that_were_typed():
-    setup = workers.setup_of(sejax.config(["env=test_workers:make_room", *SOLVING[1:]]))
-    assert len(workers._programs(setup)) == 1
+    config = sejax.config(["env=test_workers:make_room", *SOLVING[1:]])
+    assert len(workers._programs(json.dumps(config.plain()))) == 1
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):

@@ -18,7 +18,6 @@ from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
 CARD = Path(__file__).with_name("card.md")
-SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +193,8 @@ def card_of(
         "call": call,
         "source": source,
         "overrides": words,
-        "license": license or SHIPPED_LICENSE,
+        "license": license
+        or "Apache-2.0, like sejax, which made it; it contains no data of others.",
     }
     parts = CARD.read_text(encoding="utf-8").rstrip().split("\n\n\n")
     kept = [x for x in parts if None not in map(values.get, re.findall(r"\{(\w+)\}", x))]

@@ -62,7 +62,6 @@ class RunProgress:
             verdict = f"{is_not}solved: {verdict}, solved at {solved_score:g}"
         elif bilevel.scoring.objective.meaning:
             verdict += f": {bilevel.scoring.objective.meaning}"
-        ending = "solved" if is_solved else "learned"
         # What names plugins is typed: no name in a file is imported.
         agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
         env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
@@ -72,7 +71,7 @@ class RunProgress:
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
         arguments += f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else ""
         self.say(
-            f"\n{bilevel.proxy.task.name}: {ending}\n"
+            f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'learned'}\n"
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"

@@ -29,14 +29,12 @@ def available_cores() -> int:
 
 def platform_error() -> str:
     """The message for a `JAX_PLATFORMS` that jax lacks, of which other code fails; else empty."""
-    platforms = os.environ.get("JAX_PLATFORMS")
-    if not platforms:
-        return ""
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError):
-        must = "must name what jax was installed for and finds here"
-        return f"JAX_PLATFORMS {must}; got {platforms}. Set JAX_PLATFORMS=cpu."
+    if platforms := os.environ.get("JAX_PLATFORMS"):
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError):
+            must = "must name what jax was installed for and finds here"
+            return f"JAX_PLATFORMS {must}; got {platforms}. Set JAX_PLATFORMS=cpu."
     return ""
 
 
