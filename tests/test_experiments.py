@@ -128,7 +128,7 @@ def test_an_experiment_runs_and_resumes_and_remakes_its_report(
     settings = page.settings.of(**options)
     table = page.run(settings)
     assert settings.summary_file.exists() and settings.settings_file.exists()
-    assert list(tmp_path.glob("*.png"))
+    assert list(tmp_path.glob("*.png")) or name == "null_baselines"
     text = (tmp_path / "table.md").read_text()
     assert f"`python -m experiments.{name} quick=true" in text and str(table.iloc[0, 0]) in text
 
