@@ -102,7 +102,8 @@ CURVES = {  # task, agent, training, and the least mean test return
         "cartpole",
         sejax.DiscreteTD3Config(warmup_episodes=10, batch_size=128, hidden_size=128, num_layers=2,
                                 learning_rate=5e-4),
-        TrainingConfig(max_episodes=1000, max_steps=50_000, stop_rule="solved", solved_by="train"),
+        TrainingConfig(max_episodes=1000, max_steps=50_000, stop_rule="solved", solved_by="train",
+                       time_limit_is_terminal=True),
         195,
     ),
     "ppo": (
