@@ -74,7 +74,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
     """
     rows, rng = list(table["world"].unique()), np.random.default_rng(0)
     with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(8, 1.5 + 0.6 * len(rows)))
+        figure, axis = plt.subplots(figsize=(8, 1.5 + 0.8 * len(rows)))
         for y, row in enumerate(rows):
             parts = list(table[table["world"] == row].groupby("agent", sort=False)["test_return"])
             for i, (name, returns) in enumerate(parts):
