@@ -65,7 +65,7 @@ def main() -> None:
     if args.out:
         lines = [HEAD, ["---"] * len(HEAD), *rows_of_table]
         text = "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
-        (args.out / "speed.md").write_text(text)
+        (args.out / "speed.txt").write_text(text)
         draw(table, args.out / "figure.png", machine["cpu"])
     common.finish("jax_peers", args, {"machine": machine, "rows": rows, "table": table})
 
