@@ -104,7 +104,7 @@ class Node:
 
     def workers(self):
         mine = processes(self.process.pid)
-        return [pid for pid in mine if command_line(pid).startswith("ray::score")]
+        return [pid for pid in mine if command_line(pid).startswith("ray::call")]
 
     def kill(self):
         end(self.process)

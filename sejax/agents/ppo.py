@@ -393,7 +393,7 @@ class ContinuousPPO(PPO):
         return self.max_action * jnp.tanh(outputs)
 
     def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[Steps, Steps]:
-        standardized = (action - self.mode(outputs)) / std[:, None]
+        standardized = (action - self.mode(outputs)) * (1 / std)[:, None]
         log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
         log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
         return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
