@@ -28,6 +28,7 @@ from experiments.common import figures, tables
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import difference_interval
 from sejax.agents.fixed import make_fixed
+from sejax.envs import with_one_done
 from sejax.envs.wrappers import repeat_actions
 from sejax.evaluation import make_tester
 from sejax.gym import GYMNASIUM_IDS
@@ -223,18 +224,6 @@ REJAX = {
 }
 
 
-class OneDone:
-    """An environment as rejax knows them: `step` returns one `done`."""
-
-    def __init__(self, env: Any):
-        self.env, self.default_params, self.reset = env, env.default_params, env.reset
-        self.action_space, self.observation_space = env.action_space, env.observation_space
-
-    def step(self, *args: Any) -> tuple[Any, ...]:
-        obs, state, reward, terminated, truncated, info = self.env.step(*args)
-        return obs, state, reward, terminated | truncated, info
-
-
 def train_rejax(cell: Cell) -> Train:
     import rejax
 
@@ -248,7 +237,7 @@ def train_rejax(cell: Cell) -> Train:
         options["target_entropy_ratio"] = config.target_entropy_fraction
     env = repeat_actions(task.env, TASKS[cell.task][5])
     algorithm = (rejax.SAC if cell.agent == "sac" else rejax.DQN).create(
-        env=OneDone(env), skip_initial_evaluation=True, **options
+        env=with_one_done(env), skip_initial_evaluation=True, **options
     )
     algorithm = algorithm.replace(eval_callback=lambda *_: jnp.zeros(()))
 

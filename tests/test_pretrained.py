@@ -71,7 +71,7 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     assert all(stored.learned_with(group) for group in ("exploration", "es", "objective"))
     if proxy.kind == "se":
         assert config.training == sejax.training_of(stored)
-    if proxy.kind == "se" and not proxy.policy_return is not None:
+    if proxy.kind == "se" and proxy.policy_return is None:
         assert config.proxy == stored.env.config and config.es == stored.learned_with("es")
 
 
