@@ -98,20 +98,9 @@ def of_cpu(args: argparse.Namespace) -> list[dict[str, Any]]:
     """The figures of this machine's CPU, as sejax computes where there is no other device."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cpu.json"
-        command = [
-            sys.executable,
-            __file__,
-            "--json",
-            str(path),
-            "--minutes",
-            f"{args.minutes / 3}",
-        ]
-        subprocess.run(
-            command,
-            env=os.environ | {"JAX_PLATFORMS": "cpu"},
-            stdout=subprocess.DEVNULL,
-            check=True,
-        )
+        command = [sys.executable, __file__, f"--json={path}", f"--minutes={args.minutes / 3}"]
+        environ = os.environ | {"JAX_PLATFORMS": "cpu"}
+        subprocess.run(command, env=environ, stdout=subprocess.DEVNULL, check=True)
         rows: list[dict[str, Any]] = json.loads(path.read_text())["figures"]
         return rows
 
@@ -283,8 +272,8 @@ def early(config: Any) -> dict[str, Any]:
 
 def throughput(name: str, num: int, steps: int) -> Any:
     train, keys, params = training_of(name, num, steps)
-    fn = jax.vmap(train, (0, None))
-    return (lambda keys, params: fn(keys, params).train_steps.sum()), (keys, params)
+    fn = sejax.spread_over_devices(lambda key: train(key, params).train_steps)
+    return (lambda keys: fn(keys).sum()), (keys,)
 
 
 def generation(size: int) -> Any:

@@ -1,4 +1,4 @@
-"""CPU time of an agent's step in JAX on one core: sejax against rejax.
+"""Time of an agent's step in JAX, CPU time of one core or wall-clock of a GPU: sejax, rejax.
 
 Networks, batches, buffers and numbers of updates are equal: two hidden layers, batches of 64, an
 update a step; PPO has one environment, rollouts of 128 steps, 4 minibatches and 10 epochs. Agents
@@ -8,6 +8,7 @@ compilation is not in the time of a step and stands beside it.
 
     pip install '.[examples]'
     python benchmarks/jax_peers.py
+    python benchmarks/jax_peers.py --worlds task --agents 1024 --modes vmap  # on a GPU
 """
 
 import argparse
@@ -47,7 +48,9 @@ def main() -> None:
     machine = common.machine(("jax", "rejax", "sejax"))
     rows = []
     with common.sides_of(__file__, SIDES, core=args.core, seed=args.seed) as sides:
-        for case, world, agents, mode in itertools.product(cases, args.worlds, args.agents, MODES):
+        machine |= sides["sejax"].ready
+        choices = itertools.product(cases, args.worlds, args.agents, args.modes)
+        for case, world, agents, mode in choices:
             request = {"case": case, "world": world, "agents": agents, "mode": mode}
             answers = common.in_turns(sides, [request] * args.repeats)
             row = request | {
@@ -61,12 +64,13 @@ def main() -> None:
         [x["case"], x["world"], x["agents"], *(f"{x[side]:.1f}" for side in SIDES),
          f"{x['ratio']:.2f}", f"{x['vmap_over_map']:.2f}"] for x in table
     ]  # fmt: skip
-    common.print_table("CPU microseconds a step, the better of map and vmap", HEAD, rows_of_table)
+    title = f"Microseconds a step on {machine['device']}, the better of map and vmap"
+    common.print_table(title, HEAD, rows_of_table)
     if args.out:
         lines = [HEAD, ["---"] * len(HEAD), *rows_of_table]
         text = "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
         (args.out / "speed.txt").write_text(text)
-        draw(table, args.out / "figure.png", machine["cpu"])
+        draw(table, args.out / "figure.png", f"one core of an {machine['cpu']}")
     common.finish("jax_peers", args, {"machine": machine, "rows": rows, "table": table})
 
 
@@ -75,6 +79,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", nargs="+", metavar="CASE", help="such as 'ddqn 64 cartpole'")
     parser.add_argument("--worlds", nargs="+", choices=("task", "se"), default=["task", "se"])
     parser.add_argument("--agents", nargs="+", type=int, default=[1, 16], help="in a program")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write table and figure there")
     common.add_core(parser)
@@ -82,13 +87,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def best_of_modes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """For each case, world and number of agents each side's better time and their ratio."""
+    names = ("case", "world", "agents")
     table = []
-    for by_map, by_vmap in zip(rows[::2], rows[1::2], strict=True):
-        times = {side: [row[f"{side}_us"]["median"] for row in (by_map, by_vmap)] for side in SIDES}
+    for case, modes in itertools.groupby(rows, lambda row: {x: row[x] for x in names}):
+        by_mode = list(modes)
+        times = {side: [row[f"{side}_us"]["median"] for row in by_mode] for side in SIDES}
         best = {side: min(values) for side, values in times.items()}
-        mapped, vmapped = times["sejax"]
-        ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": vmapped / mapped}
-        table.append({x: by_map[x] for x in ("case", "world", "agents")} | best | ratios)
+        last, first = times["sejax"][-1], times["sejax"][0]
+        ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": last / first}
+        table.append(case | best | ratios)
     return table
 
 
@@ -104,7 +111,7 @@ def draw(table: list[dict[str, Any]], path: Path, cpu: str) -> None:
         axes.barh(np.arange(len(shown)) + offset, [row[side] for row in shown], 0.4, label=side)
     axes.set_yticks(range(len(shown)), [row["case"] for row in shown])
     axes.invert_yaxis()
-    axes.set(xscale="log", xlabel=f"CPU microseconds a step, one core of an {cpu}")
+    axes.set(xscale="log", xlabel=f"CPU microseconds a step, {cpu}")
     axes.legend()
     figure.savefig(path)
 
@@ -112,10 +119,13 @@ def draw(table: list[dict[str, Any]], path: Path, cpu: str) -> None:
 def serve(side: str, args: argparse.Namespace) -> None:
     """A side: compiles what it is asked for the first time, and trains."""
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # the sides share a GPU's memory
     import jax
 
     import sejax
 
+    device = jax.devices()[0]
+    clock = "cpu_s" if device.platform == "cpu" else "wall_s"
     programs: dict[tuple[str, ...], tuple[Any, int, float]] = {}
 
     def keys(agents: int) -> Any:
@@ -138,9 +148,9 @@ def serve(side: str, args: argparse.Namespace) -> None:
         program, steps, compile_s = programs[name]
         inputs = keys(request["agents"])
         _, times = common.measure(lambda: jax.block_until_ready(program(inputs)))
-        return {"us": 1e6 * times["cpu_s"] / (steps * request["agents"]), "compile_s": compile_s}
+        return {"us": 1e6 * times[clock] / (steps * request["agents"]), "compile_s": compile_s}
 
-    common.serve({}, handle)
+    common.serve({"device": device.device_kind}, handle)
 
 
 def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
