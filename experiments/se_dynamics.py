@@ -3,9 +3,10 @@
 Kinds of SEs that may teach through their dynamics are learned with the same agents and strategy,
 beside the bandit of `preset=best`: with soft ends, which are handed over as a discount; with the
 same as probabilities (`bernoulli`); with ends at a threshold, which no episode of `shortest` has
-before a tenth of the task's step limit; and with ten steps an episode at most. The best SE of each
-run then trains fresh agents of several kinds, and takes the myopia test (`se_myopia`): what agents
-with smaller discounts learn on it.
+before a tenth of the task's step limit; and with ten steps an episode at most. With ends at a
+threshold, SEs are learned from two, three and four algorithms at once too. The best SE of each run
+then trains fresh agents of several kinds, and takes the myopia test (`se_myopia`): what agents of
+the first algorithm that it was learned with learn on it with smaller discounts.
 
 All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
 """
@@ -32,6 +33,9 @@ from sejax.runs import workers
 
 # On Pendulum, preset=best has a reward whose best action is known.
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", "proxy.reward_form=network")
+# How many algorithms an SE is learned from, by kind: the first of these that fit its actions.
+MIXTURES = {"two": 2, "three": 3, "four": 4}
+ALGORITHMS = {True: ("ddqn", "ppo", "sac", "td3_discrete"), False: ("td3", "sac", "ppo")}
 # Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
@@ -40,6 +44,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
     "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
     "ten_steps": (*WHOLE, "proxy.horizon=10", "proxy.done=threshold"),
+    **{name: (*WHOLE, "proxy.done=threshold", f"agents={{{name}}}") for name in MIXTURES},
 }
 NAMES = {  # as people write them
     "bandit": "one step",
@@ -48,6 +53,9 @@ NAMES = {  # as people write them
     "bernoulli": "random terminations",
     "shortest": "threshold, no short episodes",
     "ten_steps": "ten steps",
+    "two": "threshold, two algorithms",
+    "three": "threshold, three algorithms",
+    "four": "threshold, four algorithms",
 }
 
 
@@ -69,7 +77,7 @@ class SeDynamics(RunSettings):
     quick_run = runs.QUICK
 
     generations: int | None = count(40, quick=3)
-    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))
+    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(KINDS), quick=("bandit", "threshold"))
     runs: int = count(10, quick=2)
     max_steps: int = count(4000, quick=1000)
     students: tuple[str, ...] = setting((), each_of(agents.KINDS))
@@ -82,8 +90,10 @@ class SeDynamics(RunSettings):
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
-        tenth = envs.make(self.env).max_steps // 10
-        words = [word.format(tenth=tenth) for word in KINDS[kind]]
+        task = envs.make(self.env)
+        algorithms = ALGORITHMS[task.num_actions is not None]
+        lists = {name: f"[{','.join(algorithms[:count])}]" for name, count in MIXTURES.items()}
+        words = [word.format(tenth=task.max_steps // 10, **lists) for word in KINDS[kind]]
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
@@ -142,7 +152,7 @@ def test(
     for student, agent in students.items():
         rows = agents.train_groups(condition(student, agent), own, settings.num_agents)
         tables.append(rows.assign(student=student))
-    (learner,) = se.learned_agents().values()
+    learner = next(iter(se.learned_agents().values()))
     tables.append(se_myopia.train_with_discounts(own, condition("discount-", learner)))
     settings.shards.made_with |= own.shards.made_with
     return pd.concat(tables, ignore_index=True).reindex(columns=list(TESTS))
