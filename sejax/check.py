@@ -47,6 +47,7 @@ from sejax.training import TrainingConfig
 
 DISCOUNTS = (0.0, 0.5, 0.9)  # beside the agents' own
 FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, what is often fastest on the task
+# Mania et al. (2018) search the hyperparameters for each task; here they are the same for all.
 ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
 ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
 FREE = {"devices", "machines", "out_dir", "num_agents"}  # when the command is repeated

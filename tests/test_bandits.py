@@ -61,7 +61,7 @@ def test_a_search_ends_when_its_steps_are_spent():
     task = dataclasses.replace(envs.make("pendulum"), max_steps=9, params=None)  # of all episodes
     teacher = bandits.searched(task, real_steps=1, seed=0)
     copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
-    one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS.num_directions + 1
+    one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS["num_directions"] + 1
     assert copied.real_steps == 9 * one_generation
 
 

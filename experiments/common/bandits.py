@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 import sejax
 from sejax.agents.fixed import make_fixed
+from sejax.check import ARS
 from sejax.distillation.policy_search import Policy, SearchConfig, linear_act, make_search
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
@@ -193,21 +194,10 @@ def searched(task: Task, real_steps: int, seed: int) -> Teacher:
     return Teacher(agent, best, key_copy, used, time.process_time() - started)
 
 
-# Mania et al. search these for each task; here they are the same for all.
-ARS = SearchConfig(
-    num_directions=16,
-    num_top=8,
-    noise_std=0.3,
-    step_size=0.3,
-    policy_error=0.0,
-    num_tests=TEST_EPISODES,
-)
-
-
 @functools.cache
 def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
     """The linear policy as an agent, one that does nothing, and a compiled, tested generation."""
-    search = make_search(ARS, task)
+    search = make_search(SearchConfig(**ARS), task)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
 
     def generation(key: Array, policy: Policy) -> tuple[Policy, Array, Any]:
