@@ -31,7 +31,7 @@ def scale_by_adam(eps: float = 1e-8) -> optax.GradientTransformation:
         mean = optax.tree.update_moment(gradient, state.mu, _DECAYS[0], 1)
         square = optax.tree.update_moment_per_elem_norm(gradient, state.nu, _DECAYS[1], 2)
         count = optax.safe_increment(state.count)
-        mean_scale, square_scale = (1 / (1 - decay**count) for decay in _DECAYS)
+        mean_scale, square_scale = 1 / (1 - jnp.array(_DECAYS) ** count)
         direction = jax.tree.map(
             lambda m, s: m * mean_scale / (jnp.sqrt(s * square_scale) + eps), mean, square
         )
