@@ -185,6 +185,7 @@ def make_evaluator(
     task: Task,
     training: TrainingConfig,
     test_env: Callable[[Environment], Environment] = lambda env: env,
+    in_batches: bool = True,
 ) -> Callable[..., Outcome]:
     """Builds `evaluate(key, env_params, active=True, test_params=None) -> Outcome`.
 
@@ -199,6 +200,7 @@ def make_evaluator(
       task: the real task.
       training: stopping rule and limits.
       test_env: as of `make_tester`, for the test after the training.
+      in_batches: as of `make_trainer`.
 
     Raises:
       ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
@@ -225,7 +227,7 @@ def make_evaluator(
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)
-        train = make_tested_trainer(agent, env, task, training)
+        train = make_tested_trainer(agent, env, task, training, in_batches=False)
 
         def run(
             key: Array,
@@ -250,7 +252,9 @@ def make_evaluator(
 
         return run
 
-    run = in_batches_on_cpu(agent.fresh(make_run), num_parallel_on_cpu(agent, training))
+    run = agent.fresh(make_run)
+    if in_batches:
+        run = in_batches_on_cpu(run, num_parallel_on_cpu(agent, training))
     return lambda key, env_params, active=True, test_params=None: run(
         key, env_params, jnp.asarray(active), test_params
     )
@@ -341,7 +345,7 @@ def _evaluation_program(
     devices: int | None,
 ) -> Callable[[Array, PyTree], Outcome]:
     """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
-    evaluate = make_evaluator(agent, env, task, training)
+    evaluate = make_evaluator(agent, env, task, training, in_batches=False)
 
     def program(keys: Array, env_params: PyTree) -> Outcome:
         def one(key: Array) -> Outcome:

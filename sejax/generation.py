@@ -85,7 +85,8 @@ class GenerationEvaluator:
         training = tested_throughout(training) if objective.needs_tests else training
 
         def run_with(agent: Agent) -> Callable[[Trainings], Outcome]:
-            evaluate = make_evaluator(agent, proxy, proxy.task, training, objective.test_env)
+            worlds = proxy, proxy.task, training, objective.test_env
+            evaluate = make_evaluator(agent, *worlds, in_batches=False)
             return lambda training: evaluate(
                 training.key,
                 proxy.params(unravel(training.candidate)),

@@ -172,6 +172,7 @@ def make_trainer(
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
     recorder: BufferMaker | None = None,
+    in_batches: bool = True,
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
@@ -194,6 +195,7 @@ def make_trainer(
         `training.num_tests_between` is not 0.
       recorder: keeps steps for whoever looks at the training, as an agent's `buffer` does for the
         agent; what it kept is `TrainResult.recorded`.
+      in_batches: whether `vmap` takes as many agents at a time on a CPU as are fastest.
 
     Raises:
       ConfigError: for arguments of other kinds, or if `training` has a fixed number of steps and
@@ -228,8 +230,9 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
-    train = in_batches_on_cpu(loop.train, num_parallel_on_cpu(agent, training))
+    train = _Loop(agent, env, training, solved_reward, test_fn, recorder).train
+    if in_batches:
+        train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
     return lambda key, env_params, hparams=None, active=True: train(
         key, env_params, agent.hparams if hparams is None else hparams, jnp.asarray(active)
     )
