@@ -348,13 +348,11 @@ def _evaluation_program(
     evaluate = make_evaluator(agent, env, task, training, in_batches=False)
 
     def program(keys: Array, env_params: PyTree) -> Outcome:
-        def one(key: Array) -> Outcome:
-            return evaluate(key, env_params)
-
         width = num_parallel_on_cpu(agent, training)
         if width is not None:
             width = min(width, cpu.width_of(keys.shape[0]))
-        spread: Outcome = spread_over_devices(one, devices, num_parallel, width)(keys)
+        train = functools.partial(evaluate, env_params=env_params)
+        spread: Outcome = spread_over_devices(train, devices, num_parallel, width)(keys)
         return spread
 
     return jax.jit(program, compiler_options=compiler_options())
