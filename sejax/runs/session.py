@@ -72,9 +72,9 @@ def run(
                 cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
                 rows = directory.save(saved, info, wall_s, cpu_s)
                 save_proxies(directory, bilevel, saved, first)
-                for generation in _finished(rows, info):
-                    report.on_generation(generation)
-                    tracker.on_generation(generation)
+            for generation in _finished(rows, info):
+                report.on_generation(generation)
+                tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
