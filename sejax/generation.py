@@ -87,12 +87,12 @@ class GenerationEvaluator:
         def run_with(agent: Agent) -> Callable[[Trainings], Outcome]:
             worlds = proxy, proxy.task, training, objective.test_env
             evaluate = make_evaluator(agent, *worlds, in_batches=False)
-            return lambda training: evaluate(
-                training.key,
-                proxy.params(unravel(training.candidate)),
-                training.active,
-                training.test_params,
-            )
+
+            def run(one: Trainings) -> Outcome:
+                params = proxy.params(unravel(one.candidate))
+                return evaluate(one.key, params, one.active, one.test_params)
+
+            return run
 
         self.runs = [run_with(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
