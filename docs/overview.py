@@ -34,7 +34,7 @@ COLORS = {
     "the evolved SE that ships": "#000000",
 }
 MARKERS = {"ddqn": ("o", ""), "td3_discrete": ("^", "white")}
-STYLES = {"a2c": "-", "ppo": "--", "dqn": ":"}
+STYLES = {"a2c": "-", "ppo": "--"}
 BOXES = {
     "es": (0.5, 0.87, "evolution strategy\nperturbs the weights"),
     "se": (0.83, 0.56, "SE\na small network:\nstate, action → reward"),
