@@ -16,22 +16,22 @@ PAGE = Path(__file__).parents[1] / "docs/zoo.md"
 def page() -> str:
     """The text of the page."""
     head = PAGE.read_text(encoding="utf-8").partition("\n\n| name |")[0]
-    rows = sorted(map(row, sejax.pretrained()), key=lambda x: x["solved by"].startswith("not"))
+    rows = sorted(map(row, sejax.pretrained()), key=lambda x: x["solved by"] == "none")
     return f"{head}\n\n{table(rows)}\n"
 
 
 def row(proxy: sejax.PretrainedProxy) -> dict[str, str]:
     """A proxy's row of the table."""
     solved_reward = sejax.load_proxy(proxy.name).task.solved_reward
-    means: dict[str, float] = {}
-    for evaluation in proxy.on_proxy:
-        means.setdefault(evaluation.agent, evaluation.return_mean)
-    marks = [name if mean >= solved_reward else f"not {name}" for name, mean in means.items()]
+    # Of an agent with several evaluations the first counts.
+    means = {each.agent: each.return_mean for each in reversed(proxy.on_proxy)}
+    solved = [name for name in sorted(means) if means[name] >= solved_reward]
     assert proxy.learning
     return {
         "name": f"`{proxy.name}`",
         "solved at": f"{solved_reward:g}",
-        "solved by": ", ".join(sorted(marks, key=lambda x: x.startswith("not "))),
+        "solved by": ", ".join(solved) or "none",
+        "not by": ", ".join(sorted(means.keys() - set(solved))),
         "score": spread([each.return_mean for each in proxy.on_proxy], ".1f"),
         "real steps": f"{proxy.learning.real_steps / 1e6:.1f}M",
     }
