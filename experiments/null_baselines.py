@@ -290,7 +290,8 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         "tests in them, CPU seconds of SEs of policies neither tests nor compilation. Costs of the "
         "best of four are those of all four."
     )
-    title = f"What does as well as an SE on {settings.env}"
+    spread = {np.inf: " in wide states", 0.5: " in narrow states"}.get(settings.spread, "")
+    title = f"What does as well{spread} as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)
 
 

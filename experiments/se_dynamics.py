@@ -200,21 +200,23 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, curves, settings.folder / "curves.png")
     columns: dict[str, Any] = {
         "SE": lambda row: NAMES[row.kind],
+        "real steps": lambda row: tables.steps_text(row.steps_to_solve),
+        "verdicts": lambda row: ", ".join(
+            f"{x} {count}" for x in se_myopia.KINDS if (count := getattr(row, x.replace(" ", "_")))
+        ),
+    }
+    for discount in se_myopia.DISCOUNTS:
+        columns[f"discount {discount:g}"] = tables.mean_text(se_myopia.column(discount), 1)
+    columns |= {
         "steps of an episode": "{episode_steps:.1f}",
         "first solved": "{first_solved} of {runs}",
         "in generation": lambda row: tables.known_text(row.generations_to_solve, ",.0f") or "-",
-        "real steps": lambda row: tables.steps_text(row.steps_to_solve),
         "CPU s": lambda row: tables.known_text(row.cpu_s_to_solve, ",.0f") or "-",
         "CPU s a generation": "{cpu_s:.2f}",
         "SEs that solve": "{solved} of {runs}",
     }
     for student in agents["student"].dropna().unique():
         columns[figures.agent_name(student)] = tables.mean_text(f"on_{student}", 1)
-    for discount in se_myopia.DISCOUNTS:
-        columns[f"discount {discount:g}"] = tables.mean_text(se_myopia.column(discount), 1)
-    columns["verdicts"] = lambda row: ", ".join(
-        f"{x} {count}" for x in se_myopia.KINDS if (count := getattr(row, x.replace(" ", "_")))
-    )
     summary = summary.rename(columns=lambda name: name.replace(" ", "_"))
     note = (
         f"NES runs of {settings.generations} generations; costs (without compilation) until the "

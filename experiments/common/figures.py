@@ -105,7 +105,7 @@ def runs(axis: Any, curves: pd.DataFrame, solved_reward: float) -> None:
     axis.plot(lines.index + 1, mean, color=REAL, lw=2.4, label="mean ± std of the runs")
     axis.fill_between(lines.index + 1, mean - std, mean + std, color=REAL, alpha=0.15, lw=0)
     threshold(axis, solved_reward, f"solved ({solved_reward:g})")
-    axis.set(xlabel="NES outer iteration", xlim=(1, max(lines.index[-1] + 1, 2)))
+    axis.set(xlabel="generation", xlim=(1, max(lines.index[-1] + 1, 2)))
 
 
 @contextlib.contextmanager
