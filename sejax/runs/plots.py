@@ -73,6 +73,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
       title: what was checked, and the verdict.
     """
     rows, rng = list(table["world"].unique()), np.random.default_rng(0)
+    kinds = list(dict.fromkeys(name.partition("-")[0] for name in table["agent"]))
     with plt.rc_context(STYLE):
         figure, axis = plt.subplots(figsize=(8, 1.5 + 0.8 * len(rows)))
         for y, row in enumerate(rows):
@@ -80,7 +81,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
             for i, (name, returns) in enumerate(parts):
                 level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
                 spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
-                color = AGENTS[i % len(AGENTS)]
+                color = AGENTS[kinds.index(name.partition("-")[0]) % len(AGENTS)]
                 axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
                 axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
                 axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)
