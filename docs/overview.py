@@ -40,7 +40,7 @@ BOXES = {
     "se": (0.83, 0.56, "SE\na small network:\nstate, action → reward"),
     "agent": (0.68, 0.14, "agent\ntrains on the SE alone"),
     "task": (0.2, 0.14, "real task\ntests the agent"),
-    "score": (0.15, 0.56, "score\nthe agent's return"),
+    "score": (0.17, 0.56, "score\nthe agent's return"),
 }
 ARROWS = [("es", "se"), ("se", "agent"), ("agent", "task"), ("task", "score"), ("score", "es")]
 
