@@ -229,7 +229,9 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     config = sejax.config([*LEARN, f"objective={objective}"])
     assert config.training.stop_rule == "solved"
     changes = {"stop_rule": "never", "tests_between": 1}
-    monkeypatch.setattr(generation, "make_evaluator", lambda *parts: trainings.append(parts[3]))
+    monkeypatch.setattr(
+        generation, "make_evaluator", lambda *parts, **_: trainings.append(parts[3])
+    )
     trainings = []
     bilevel.make_bilevel(**config.parts())
     assert trainings == [dataclasses.replace(config.training, **changes)]
