@@ -83,7 +83,11 @@ def draw_agents(axes: Axes) -> None:
     axes.plot(GRID, tuned.mean(axis=0), color=ORANGE, linewidth=1.8, label="tuned PPO on the task")
     axes.axhline(-100, color="black", linewidth=0.6)
     axes.text(20_500, -104, "solved", ha="left", va="center", fontsize=8)
-    axes.set(xlabel="training steps (blue: on the SE)", ylabel="return on the real Acrobot", xlim=(0, 20_500))
+    axes.set(
+        xlabel="training steps (blue: on the SE)",
+        ylabel="return on the real Acrobot",
+        xlim=(0, 20_500),
+    )
     axes.set_xticks(range(0, 20_001, 5000))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.set_title("Agents on Acrobot")
