@@ -33,7 +33,7 @@ test-suites: TESTS := other_suites
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
-test-examples: TESTS := examples gym_sb3 torch_reference torch_nes
+test-examples: TESTS := examples gym_sb3 torch_reference
 
 # A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.
 test-ray: PACKAGES := --constraint constraints.txt --editable '.[ray,search]'
