@@ -67,6 +67,7 @@ AGENTS = {
 def main() -> None:
     args = common.parse_args(__doc__, add_options)
     configure_jax()
+    sejax.configure_xla()  # each core is a device
     try:
         cpu = jax.devices("cpu")[0]
     except RuntimeError as error:

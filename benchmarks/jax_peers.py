@@ -90,11 +90,11 @@ def best_of_modes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     names = ("case", "world", "agents")
     table = []
     for case, modes in itertools.groupby(rows, lambda row: {x: row[x] for x in names}):
-        by_mode = list(modes)
-        times = {side: [row[f"{side}_us"]["median"] for row in by_mode] for side in SIDES}
-        best = {side: min(values) for side, values in times.items()}
-        last, first = times["sejax"][-1], times["sejax"][0]
-        ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": last / first}
+        by_mode = {row["mode"]: row for row in modes}
+        times = {x: {m: row[f"{x}_us"]["median"] for m, row in by_mode.items()} for x in SIDES}
+        best = {side: min(times[side].values()) for side in SIDES}
+        vmapped, mapped = (times["sejax"].get(mode, float("nan")) for mode in ("vmap", "map"))
+        ratios = {"ratio": best["rejax"] / best["sejax"], "vmap_over_map": vmapped / mapped}
         table.append(case | best | ratios)
     return table
 
