@@ -29,7 +29,7 @@ from jax import Array
 
 import sejax
 from sejax.agents import AgentOptions, Hparams, Transition, replay_buffer, traced
-from sejax.options import counts, fraction, option, positive
+from sejax.options import Count, Fraction, Positive, option
 
 MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
 ADAM = optax.scale_by_adam()  # the learning rate, which is traced, is applied below
@@ -45,12 +45,12 @@ class SAC(AgentOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    batch_size: int = option(128, counts())
-    buffer_size: int = option(100_000, counts())
-    hidden_size: int = option(64, counts())
-    learning_rate: float = option(1e-3, positive("it must learn"), traced=True, varied="triple")
-    tau: float = option(0.005, fraction(), traced=True)
-    discount: float = option(0.99, fraction(), traced=True)
+    batch_size: Count = 128
+    buffer_size: Count = 100_000
+    hidden_size: Count = 64
+    learning_rate: Positive = option(1e-3, traced=True, varied="triple")
+    tau: Fraction = option(0.005, traced=True)
+    discount: Fraction = option(0.99, traced=True)
 
     def make(self, task: sejax.Task) -> sejax.Agent:
         """The agent for a task's observations and actions."""

@@ -18,7 +18,7 @@ from typing import ClassVar
 import jax
 
 import sejax
-from sejax.options import Options, not_negative, option
+from sejax.options import NonNegative, Options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class RiskAverse(Options):
 
     group: ClassVar[str] = "objective"
 
-    aversion: float = option(1.0, not_negative("a deviation is no gain"))
+    aversion: NonNegative = 1.0
 
     def make(self, task: sejax.Task) -> sejax.Objective:
         def score(outcome: sejax.Outcome) -> jax.Array:

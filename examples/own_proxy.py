@@ -23,14 +23,14 @@ from gymnax.environments import environment
 from jax import Array
 
 import sejax
-from sejax.options import option, positive
+from sejax.options import Positive
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinearSE(sejax.ProxyConfig):
     """A linear world for any task whose observations are vectors."""
 
-    init_std: float = option(0.3, positive("it must have weights"))
+    init_std: Positive = 0.3
 
     def make(self, task: sejax.Task) -> "LinearEnv":
         return LinearEnv(task, self)

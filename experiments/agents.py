@@ -25,14 +25,14 @@ import pandas as pd
 
 import sejax
 from experiments.common import figures, tables
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.statistics import difference_interval
 from sejax.agents.fixed import make_fixed
 from sejax.envs import with_one_done
 from sejax.envs.wrappers import repeat_actions
 from sejax.evaluation import make_tester
 from sejax.gym import GYMNASIUM_IDS
-from sejax.options import each_of, registry
+from sejax.options import Count, registry
 
 TEST_EPISODES = 10
 SIZES = {"hidden_size": 64, "num_layers": 2}  # as rejax's DQN has them
@@ -70,13 +70,11 @@ class Agents(Settings):
 
     name = "agents"
 
-    tasks: tuple[str, ...] = setting(tuple(TASKS), each_of(TASKS), quick=("cartpole",))
-    libraries: tuple[str, ...] = setting(
-        tuple(LIBRARIES), each_of(LIBRARIES), quick=("sejax", "terminal")
-    )
-    num_agents: int = count(20, quick=2)
-    num_torch_agents: int = count(20, quick=2)
-    steps: int | None = count(None, quick=512)
+    tasks: tuple[str, ...] = setting(tuple(TASKS), TASKS, quick=("cartpole",))
+    libraries: tuple[str, ...] = setting(tuple(LIBRARIES), LIBRARIES, quick=("sejax", "terminal"))
+    num_agents: Count = setting(20, quick=2)
+    num_torch_agents: Count = setting(20, quick=2)
+    steps: Count | None = setting(None, quick=512)
 
 
 @dataclass(frozen=True, kw_only=True)

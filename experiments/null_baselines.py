@@ -27,11 +27,11 @@ import pandas as pd
 import sejax
 from experiments.common import agents, bandits, figures, tables
 from experiments.common.agents import Condition, Group, shipped
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import worst_tenth
 from sejax import envs
-from sejax.options import each_of, one_of, positive
+from sejax.options import Count, Positive
 
 HPARAMS = ("varied", "default")
 SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
@@ -74,20 +74,20 @@ class NullBaselines(Settings):
 
     name = "null_baselines"
 
-    env: str = setting("cartpole", one_of(tuple(TEACHERS)))
-    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))
+    env: str = setting("cartpole", tuple(TEACHERS))
+    sources: tuple[str, ...] = setting(SOURCES, SOURCES)
     students: tuple[str, ...] = setting(())
-    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
-    policies: int = count(12, quick=2)
-    num_agents: int = count(5, quick=2)
-    num_evolved: int = count(20, quick=2)
-    steps: int | None = count(None, quick=500)
+    hparams: tuple[str, ...] = setting(HPARAMS, HPARAMS, quick=("default",))
+    policies: Count = setting(12, quick=2)
+    num_agents: Count = setting(5, quick=2)
+    num_evolved: Count = setting(20, quick=2)
+    steps: Count | None = setting(None, quick=500)
     shares: tuple[float, ...] = setting((0.125, 0.25, 0.5), quick=(0.5,))
-    teacher_steps: int | None = count(None, quick=500)
-    search_steps: int | None = count(None, quick=5_000)
-    num_states: int = count(1024)
-    states: str = setting("visited", one_of(("visited", "noise")))
-    widen: float = setting(1.5, positive("it is a scale"))
+    teacher_steps: Count | None = setting(None, quick=500)
+    search_steps: Count | None = setting(None, quick=5_000)
+    num_states: Count = setting(1024)
+    states: str = setting("visited", ("visited", "noise"))
+    widen: Positive = setting(1.5)
 
     @property
     def task(self) -> envs.Task:

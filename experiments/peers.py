@@ -27,10 +27,10 @@ from flax.traverse_util import unflatten_dict
 import sejax
 from experiments.common import agents, figures, tables
 from experiments.common.agents import Condition, Group, shipped
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
-from sejax.options import ConfigError, each_of, require
+from sejax.options import ConfigError, Count, require
 
 BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
 STOCK = {True: ("ppo", "a2c", "dqn"), False: ("ppo", "a2c", "sac", "td3")}  # for discrete actions
@@ -98,9 +98,9 @@ class Peers(Settings):
     name = "peers"
 
     theirs: str | None = setting(None)
-    tasks: tuple[str, ...] = setting(tuple(PUBLISHED), each_of(PUBLISHED))
-    students: tuple[str, ...] = setting(tuple(STUDENTS), each_of(STUDENTS))
-    num_groups: int = count(4, quick=1)
+    tasks: tuple[str, ...] = setting(tuple(PUBLISHED), PUBLISHED)
+    students: tuple[str, ...] = setting(tuple(STUDENTS), STUDENTS)
+    num_groups: Count = setting(4, quick=1)
     steps: tuple[int, ...] = setting((2000, 5000, 10_000), quick=(500,))
     finished: bool = setting(False)
 

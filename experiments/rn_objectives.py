@@ -24,7 +24,7 @@ import pandas as pd
 from experiments.common import reward_networks, rn_curves, tables
 from experiments.common.experiment import Experiment, setting
 from experiments.common.rn_curves import CurveSettings
-from sejax.options import each_of, require
+from sejax.options import require
 
 PICKS = ("best", "worst")  # by their scores
 OBJECTIVE_NAMES = {
@@ -47,8 +47,8 @@ class RnObjectives(CurveSettings):
 
     name = "rn_objectives"
 
-    objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES))
-    picks: tuple[str, ...] = setting(PICKS, each_of(PICKS))
+    objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, OBJECTIVE_NAMES)
+    picks: tuple[str, ...] = setting(PICKS, PICKS)
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,10 +18,10 @@ import pandas as pd
 
 import sejax
 from experiments.common import agents, figures, tables
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from sejax import distill
-from sejax.options import each_of
+from sejax.options import Count
 
 QUICK = (
     *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
@@ -45,9 +45,9 @@ class SeDistilled(Settings):
     name = "se_distilled"
 
     env: str = setting("halfcheetah")
-    students: tuple[str, ...] = setting((), each_of(agents.KINDS))
-    num_seeds: int = count(3, quick=2)
-    num_tested: int = count(10, quick=2)
+    students: tuple[str, ...] = setting((), agents.KINDS)
+    num_seeds: Count = setting(3, quick=2)
+    num_tested: Count = setting(10, quick=2)
     run: tuple[str, ...] = setting(())
 
     def words(self, seed: int) -> list[str]:

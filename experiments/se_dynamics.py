@@ -24,11 +24,11 @@ import sejax
 from experiments import se_myopia
 from experiments.common import agents, figures, runs, tables
 from experiments.common.agents import Condition, Group
-from experiments.common.experiment import Experiment, count, setting
+from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import RunSettings
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
-from sejax.options import each_of
+from sejax.options import Count
 from sejax.runs import workers
 
 # On Pendulum, preset=best has a reward whose best action is known.
@@ -76,13 +76,13 @@ class SeDynamics(RunSettings):
     name = "se_dynamics"
     quick_run = runs.QUICK
 
-    generations: int | None = count(40, quick=3)
-    kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(KINDS), quick=("bandit", "threshold"))
-    runs: int = count(10, quick=2)
-    max_steps: int = count(4000, quick=1000)
-    students: tuple[str, ...] = setting((), each_of(agents.KINDS))
-    num_agents: int = count(10, quick=5)
-    test_episodes: int = count(10)
+    generations: Count | None = setting(40, quick=3)
+    kinds: tuple[str, ...] = setting(tuple(KINDS), KINDS, quick=("bandit", "threshold"))
+    runs: Count = setting(10, quick=2)
+    max_steps: Count = setting(4000, quick=1000)
+    students: tuple[str, ...] = setting((), agents.KINDS)
+    num_agents: Count = setting(10, quick=5)
+    test_episodes: Count = setting(10)
 
     def agent_of(self, student: str) -> Any:
         """The configuration of a kind of students."""

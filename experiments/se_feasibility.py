@@ -9,18 +9,17 @@ into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixe
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
 
 from experiments.common import figures, runs, tables
-from experiments.common.experiment import Experiment, count, setting
+from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import RunSettings
 from experiments.common.statistics import worst_tenth
-from sejax.options import one_of, require
-from sejax.runs.config import AGENT_HPARAMS
+from sejax.options import Count, require
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach
 # agents to solve a task"; appendix "Discussion on the Feasibility": 40 runs of 200 iterations with
@@ -47,9 +46,9 @@ class SeFeasibility(RunSettings):
     name = "se_feasibility"
     quick_run = runs.QUICK
 
-    generations: int | None = count(None, quick=8)
-    runs: int = count(10, quick=3)
-    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))
+    generations: Count | None = setting(None, quick=8)
+    runs: Count = setting(10, quick=3)
+    agent_hparams: Literal["default", "varied"] = setting("default")
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:

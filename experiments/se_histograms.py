@@ -36,13 +36,13 @@ import sejax
 from experiments.common import agents as groups
 from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.tables import as_texts, publish, summary_by
 from sejax import ProxySet, Task, TrainingConfig
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.evaluation import make_recorder, make_tested_trainer
-from sejax.options import each_of
+from sejax.options import Count
 
 NUM_BINS, NUM_DRAWN = 2000, 80  # of the rows, and of the figure
 SOURCES = {
@@ -91,11 +91,11 @@ class SeHistograms(Settings):
     name = "se_histograms"
 
     proxy: str = setting(SOFT_SE)
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))
-    num_agents: int = count(10, quick=3)
-    test_episodes: int = count(10)
-    max_steps: int | None = count(None, quick=1500)
-    max_rows: int = count(10_000)
+    agents: tuple[str, ...] = setting(SE_AGENTS, SE_AGENTS)
+    num_agents: Count = setting(10, quick=3)
+    test_episodes: Count = setting(10)
+    max_steps: Count | None = setting(None, quick=1500)
+    max_rows: Count = setting(10_000)
 
 
 def compute(settings: SeHistograms) -> pd.DataFrame:

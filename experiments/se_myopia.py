@@ -21,13 +21,13 @@ import pandas as pd
 import sejax
 from experiments.common import agents, figures, tables
 from experiments.common.agents import Condition, Group
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import worst_tenth
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
 from sejax.myopia import MARGIN, judge
-from sejax.options import registry, require
+from sejax.options import Count, registry, require
 from sejax.proxies import header
 
 STORED = (  # below results/
@@ -55,10 +55,10 @@ class SeMyopia(Settings):
 
     env: str = setting("cartpole")
     ses: tuple[str, ...] = setting((), quick=("cartpole", agents.SOFT_SE))
-    num_ses: int = count(5, quick=1)
-    num_agents: int = count(20, quick=5)
-    test_episodes: int = count(10)
-    max_steps: int | None = count(None, quick=1000)
+    num_ses: Count = setting(5, quick=1)
+    num_agents: Count = setting(20, quick=5)
+    test_episodes: Count = setting(10)
+    max_steps: Count | None = setting(None, quick=1000)
 
 
 class Se(NamedTuple):

@@ -25,10 +25,10 @@ import sejax
 from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SE_AGENTS, Condition, return_columns
-from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, TrainingConfig, envs
-from sejax.options import each_of, require, shortened
+from sejax.options import Count, require, shortened
 
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
@@ -83,15 +83,15 @@ class SePerformance(Settings):
 
     name = "se_performance"
 
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))
-    num_agents: int = count(10, quick=4)
-    num_ses: int = count(40, quick=3)
-    test_episodes: int = count(10)
-    max_steps: int | None = count(None, quick=4000)
+    agents: tuple[str, ...] = setting(SE_AGENTS, SE_AGENTS)
+    num_agents: Count = setting(10, quick=4)
+    num_ses: Count = setting(40, quick=3)
+    test_episodes: Count = setting(10)
+    max_steps: Count | None = setting(None, quick=4000)
     varied: str | None = setting(None)
     fixed: str | None = setting(None, quick="cartpole")
-    real_groups: int | None = count(None)
-    real_episodes: int | None = count(None, quick=100)
+    real_groups: Count | None = setting(None)
+    real_episodes: Count | None = setting(None, quick=100)
 
 
 def compute(settings: SePerformance) -> pd.DataFrame:

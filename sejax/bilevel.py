@@ -27,7 +27,7 @@ from sejax.generation import Candidates, GenerationEvaluator
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_minus_inf
-from sejax.options import counts, require
+from sejax.options import Count, checked, require
 from sejax.options.registry import Makes, RunConfig, make, require_part
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import SyntheticConfig
@@ -191,7 +191,7 @@ def make_learner(
         if not isinstance(config, RunConfig):
             raise TypeError(f"config must come from sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
-    counts("a run has at least one", most=1_000_000)("generations", generations, 100)
+    checked([generations], Count, "generations", 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

@@ -20,11 +20,12 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import jax
 import pandas as pd
 import yaml
+from pydantic import Field
 
 from sejax import agents
 from sejax.agents.base import AgentConfig
@@ -35,7 +36,7 @@ from sejax.envs.base import Task
 from sejax.evaluate import World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import LEAST, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import as_text, counts, one_of, option, registry, require
+from sejax.options import LARGEST, Count, as_text, registry, require
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
@@ -74,9 +75,9 @@ class CheckConfig(EvaluateConfig):
 
     machines: Any
     algorithms: tuple[str, ...] | None = None
-    null_steps: int = option(200_000, counts("a policy must be found"))
-    num_agents: int = option(20, counts("an interval needs five", LEAST))
-    agent_hparams: str = option("default", one_of(("default", "as_learned")))
+    null_steps: Count = 200_000
+    num_agents: Annotated[int, Field(ge=LEAST, le=LARGEST)] = 20
+    agent_hparams: Literal["default", "as_learned"] = "default"
     real_training: TrainingConfig = dataclasses.replace(REAL_TRAINING, max_steps=20_000)
 
 

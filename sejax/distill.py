@@ -27,7 +27,7 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Options, counts, field_lines, option, require, shortened
+from sejax.options import Count, Options, field_lines, require, shortened
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -70,9 +70,9 @@ class DistillConfig(Options):
     copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     independent_starts: bool = False
-    num_snapshots: int = option(6, counts("something must be taught"))
-    num_students: int = option(4, counts("an SE is chosen by what it teaches"))
-    num_tested: int = option(10, counts("a card says what an SE teaches"))
+    num_snapshots: Count = 6
+    num_students: Count = 4
+    num_tested: Count = 10
 
 
 def main(overrides: Sequence[str]) -> None:

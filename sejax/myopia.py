@@ -11,9 +11,10 @@ none; more and less are those of Student's interval over agents, in pairs of equ
 
 import math
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 MARGIN = 0.1
@@ -22,7 +23,7 @@ LEAST = 5  # independent values of an interval: the range of two holds the media
 NONE = (math.nan, math.nan)  # of fewer
 
 
-def mean_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
+def mean_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float]:
     """Student's confidence interval of the mean of independent values `[n]`; `NONE` if n < `LEAST`.
 
     Average what belongs together before, such as the agents that one proxy trained.
@@ -50,7 +51,7 @@ class Judgement(NamedTuple):
     missing: int
 
 
-def judge(myopic: Any, far: Any, floor: Any, top: float) -> Judgement:
+def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Judgement:
     """Judges by the scores of agents with a discount of 0 and with their own.
 
     - dynamics: they differ by more than the margin;
@@ -68,7 +69,8 @@ def judge(myopic: Any, far: Any, floor: Any, top: float) -> Judgement:
       >>> judge([98, 99, 97, 99, 98], [99, 98, 99, 99, 99], 20.0, 95.0).verdict
       'policy'
     """
-    far, margin = np.asarray(far, float), MARGIN * (top - np.mean(floor))
+    far, floor = np.asarray(far, float), np.asarray(floor, float)
+    margin = MARGIN * (top - floor.mean())
     lost, gained = far - myopic, far - floor
     (low, high), (gain_low, gain_high) = mean_interval(lost), mean_interval(gained)
     if low > margin:

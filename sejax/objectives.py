@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.wrappers import PartlyScored, PartParams
-from sejax.options import Options, counts, not_negative, option, require
+from sejax.options import Count, NonNegative, Options, require
 
 
 @struct.dataclass
@@ -118,8 +118,8 @@ class MaxReward(ObjectiveConfig):
 
     scores_are_returns: ClassVar[bool] = True
 
-    first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
-    curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
+    first_eval_steps: Count | None = None
+    curriculum_generations: Count = 50
 
     def make(self, task: Task) -> Objective:
         objective = Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
@@ -153,7 +153,7 @@ class RewardThreshold(ObjectiveConfig):
     Source: paper, section "Learning Reward Networks".
     """
 
-    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
+    unsolved_weight: NonNegative = 100.0
 
     def make(self, task: Task) -> Objective:
         """The objective on a task that says when it is solved.

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,20 +24,9 @@ from sejax.ops.keys import step_keys
 from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
 from sejax.ops.modes import require_modes
 from sejax.ops.parallel import in_batches_on_cpu
-from sejax.options import (
-    LARGEST,
-    Options,
-    counts,
-    not_negative,
-    one_of,
-    option,
-    require,
-    shortened,
-)
+from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require, shortened
 from sejax.options.registry import require_part
 from sejax.proxies.base import ProxyEnv, is_real
-
-STOP_RULES = ("plateau", "solved", "never")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,15 +51,15 @@ class TrainingConfig(Options):
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(2000, counts("it counts episodes"))
-    min_steps: int = option(0, counts("it counts steps", least=0))
-    max_steps: int | None = option(2000, counts("an agent must train"))
-    stop_rule: str = option("never", one_of(STOP_RULES))
-    window: int = option(10, counts("it counts episodes"))
-    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
-    solved_by: str = option("test", one_of(("test", "train")))
-    test_episodes: int = option(10, counts("it counts episodes"))
-    tests_between: int = option(0, counts("it counts episodes", least=0))
+    max_episodes: Count = 2000
+    min_steps: WholeNumber = 0
+    max_steps: Count | None = 2000
+    stop_rule: Literal["plateau", "solved", "never"] = "never"
+    window: Count = 10
+    plateau_tolerance: NonNegative = 0.01
+    solved_by: Literal["test", "train"] = "test"
+    test_episodes: Count = 10
+    tests_between: WholeNumber = 0
     time_limit_is_terminal: bool = False
 
     @property

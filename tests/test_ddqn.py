@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
@@ -18,7 +19,7 @@ from support import (
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
-from sejax.options import ACTIVATIONS
+from sejax.options import Activation
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
 GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"
@@ -26,7 +27,7 @@ CONFIG = DDQNConfig(
     hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
     learning_rate=0.01, tau=0.1, discount=0.9,
 )  # fmt: skip
-EXACT = [activation for activation in ACTIVATIONS if activation != "fast_tanh"]
+EXACT = [activation for activation in get_args(Activation) if activation != "fast_tanh"]
 CASES = {activation: replace(CONFIG, activation=activation) for activation in EXACT} | {
     "dqn": replace(CONFIG, double=False),
 }

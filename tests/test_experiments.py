@@ -23,7 +23,7 @@ from experiments import peers
 from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
-from sejax.options import ConfigError, each_of, registry
+from sejax.options import ConfigError, Count, registry
 from sejax.runs import workers
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
@@ -209,8 +209,8 @@ class Example(experiment.Settings):
     name = "example"
 
     env: str = experiment.setting("cartpole")
-    agents: tuple[str, ...] = experiment.setting(("ddqn", "ppo"), each_of(("ddqn", "ppo")))
-    num_agents: int = experiment.count(10, quick=4)
+    agents: tuple[str, ...] = experiment.setting(("ddqn", "ppo"), ("ddqn", "ppo"))
+    num_agents: Count = experiment.setting(10, quick=4)
     run: tuple[str, ...] = experiment.setting(())
 
 

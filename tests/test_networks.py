@@ -1,6 +1,7 @@
 """sejax.ops.networks: initial values, layout and the forward pass."""
 
 import functools
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from sejax.ops.networks import (
     fast_tanh,
     tanh,
 )
-from sejax.options import ACTIVATIONS
+from sejax.options import Activation
 
 
 @functools.cache
@@ -43,7 +44,7 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
 
 
 @pytest.mark.parametrize("num_layers", [1, 2])
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("activation", get_args(Activation))
 def test_forward_of_one_input_or_a_batch_equals_a_numpy_loop(activation, num_layers):
     apply, params = network(4, 3, 5, num_layers, activation)
     batch = np.random.default_rng(0).normal(size=(4, 5)) * 2  # [feature, batch]

@@ -11,12 +11,25 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin
 
 from sphinx.application import Sphinx
 
 from experiments.common.experiment import Settings
+from sejax import options
 from sejax.options import Options, help_texts
+
+BOUNDED_TYPES = {x: n for n, x in vars(options).items() if get_origin(x) is Annotated}
+
+
+def type_text(hint: Any) -> str:
+    """A field's type, by its name in `sejax.options` if it has one there."""
+    if type(None) in get_args(hint):
+        return " | ".join(map(type_text, get_args(hint)))
+    if get_origin(hint) is Annotated:
+        return BOUNDED_TYPES.get(hint) or type_text(get_args(hint)[0])
+    text = re.sub(r"(\w+\.)+(?=\w)", "", inspect.formatannotation(hint))
+    return text.replace("NoneType", "None")
 
 
 def comments_of_fields(cls: type) -> dict[str, str]:
@@ -52,8 +65,7 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
     for field in dataclasses.fields(cls):
         if field.init and not field.name.startswith("_") and field not in shared:
             default = "" if field.default is dataclasses.MISSING else repr(field.default)
-            type_name = re.sub(r"(\w+\.)+(?=\w)", "", inspect.formatannotation(field.type))
-            yield field.name, type_name, default, comments.get(field.name, "")
+            yield field.name, type_text(field.type), default, comments.get(field.name, "")
 
 
 def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:

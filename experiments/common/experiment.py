@@ -10,7 +10,7 @@ import functools
 import json
 import lzma
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_origin, get_type_hints
@@ -20,7 +20,7 @@ import pandas as pd
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.ops.files import write_bytes
-from sejax.options import Rule, as_text, require, shortened
+from sejax.options import Count, as_text, require, require_known, shortened
 from sejax.options.plain import from_plain, parsed
 from sejax.runs import commands, compose, runtime
 
@@ -29,21 +29,16 @@ RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run", "theirs", "finished"}
 
 
-def setting(default: Any, rule: Rule | None = None, *, quick: Any = None) -> Any:
+def setting(default: Any, choices: Collection[str] = (), *, quick: Any = None) -> Any:
     """A field of `Settings`, whose docstring has its help text.
 
     Args:
       default: its default; None where it may be left open.
-      rule: what must hold, as in `sejax.options`.
+      choices: the names that it may have, or each of it.
       quick: its default with `quick=true`, if it is another one.
     """
-    metadata = {"rule": rule, "quick": default if quick is None else quick}
+    metadata = {"choices": choices, "quick": default if quick is None else quick}
     return dataclasses.field(default=default, metadata=metadata)
-
-
-def count(default: int | None, least: int = 1, *, quick: Any = None) -> Any:
-    """A field that counts something, `least` of them at least."""
-    return setting(default, options.counts("nothing is computed otherwise", least), quick=quick)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +63,16 @@ class Settings(options.Options):
     from_rows: bool = setting(False)
     out: str | None = setting(None)
     work: str | None = setting(None)
-    seed: int = setting(0, options.seed())
-    devices: int | None = count(None)
+    seed: options.WholeNumber = setting(0)
+    devices: Count | None = setting(None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         fields = vars(self)
+        for field in dataclasses.fields(self):
+            value, choices = fields[field.name], field.metadata["choices"]
+            for name in (value if isinstance(value, tuple) else [value]) if choices else []:
+                require_known(field.name, name, choices)
         for word in fields.get("run", ()):
             name = word.partition("=")[0]
             require(

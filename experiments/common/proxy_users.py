@@ -3,18 +3,19 @@
 import dataclasses
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 
 import sejax
 from experiments.common import agents, curves
 from experiments.common.agents import OUTCOMES, Condition, Group
-from experiments.common.experiment import Settings, count, setting
+from experiments.common.experiment import Settings, setting
 from experiments.common.shards import stack
 from sejax import Proxy, Task, TrainingConfig, options
-from sejax.options import each_of, registry
+from sejax.options import Count, registry
 from sejax.proxies.header import pretrained_names
 
 NUM_GROUPS = 5  # of agents: the CPU seconds of a group are one value
@@ -52,13 +53,13 @@ class BreakEven(Settings):
     name = "break_even"
 
     proxies: tuple[str, ...] = setting(
-        tuple(pretrained_names()), each_of(pretrained_names()), quick=("cliff_walking-rn",)
+        tuple(pretrained_names()), pretrained_names(), quick=("cliff_walking-rn",)
     )
-    num_agents: int | None = count(None, NUM_GROUPS, quick=10)
-    num_pilots: int | None = count(None, quick=2)
-    max_steps: int | None = count(None, quick=3000)
-    test_episodes: int = count(10)
-    seed: int = setting(1000, options.seed())
+    num_agents: Annotated[int, Field(ge=NUM_GROUPS)] | None = setting(None, quick=10)
+    num_pilots: Count | None = setting(None, quick=2)
+    max_steps: Count | None = setting(None, quick=3000)
+    test_episodes: Count = setting(10)
+    seed: options.WholeNumber = setting(1000)
 
     def counts(self, task: Task) -> tuple[int, int]:
         """How many agents of each sort, and how many pilots."""

@@ -24,11 +24,11 @@ import pandas as pd
 
 import sejax
 from experiments.common import agents, figures, runs
-from experiments.common.experiment import count, setting, work_beside
+from experiments.common.experiment import setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
 from sejax import ICMConfig
-from sejax.options import ConfigError, each_of, listed, one_of, registry
+from sejax.options import ConfigError, Count, listed, registry, require_known
 from sejax.options.plain import flatten
 from sejax.runs import config as configuration
 from sejax.runs import run_directory
@@ -164,24 +164,25 @@ class RnSettings(RunSettings):
 
     quick_run = ("es.population_size=8",)
 
-    env: str = setting("cliff_walking", one_of(STUDIES))
+    env: str = setting("cliff_walking", STUDIES)
     variants: tuple[str, ...] = setting(VARIANTS)
-    learned: int = count(10, quick=2)
-    generations: int | None = count(None, quick=4)
+    learned: Count = setting(10, quick=2)
+    generations: Count | None = setting(None, quick=4)
     rns_dir: str | None = setting(None)
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         usual, default = super().defaults({}), super().defaults(given)
         env = given.get("env", default["env"])
-        one_of(STUDIES)("env", env, "cliff_walking")
+        require_known("env", env, STUDIES)
         study = vars(STUDIES[env]) | {"bonuses": tuple(STUDIES[env].bonuses)}
         same = [name for name in default if name in study and default[name] == usual[name]]
         return default | {name: study[name] for name in same}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        each_of(self.study.variants)("variants", self.variants, None)
+        for variant in self.variants:
+            require_known("variants", variant, self.study.variants)
 
     @property
     def study(self) -> Study:
@@ -207,7 +208,7 @@ class RnSettings(RunSettings):
 
 def objective_setting() -> Any:
     """The setting of experiments that use the RNs of one objective."""
-    return setting("reward_threshold", one_of(OBJECTIVES))
+    return setting("reward_threshold", OBJECTIVES)
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:

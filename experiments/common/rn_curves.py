@@ -15,11 +15,11 @@ import pandas as pd
 
 from experiments.common import agents, curves, figures, tables
 from experiments.common.agents import Condition
-from experiments.common.experiment import count, setting
+from experiments.common.experiment import setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, TrainingConfig
-from sejax.options import each_of, registry, require
+from sejax.options import Count, registry, require, require_known
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
     "default": "default hyperparameters",
@@ -48,12 +48,12 @@ class CurveSettings(RnSettings):
       max_steps: of training; as the paper's figure
     """
 
-    rows: tuple[str, ...] = setting(PAPER_ROWS, each_of(ROWS))
+    rows: tuple[str, ...] = setting(PAPER_ROWS, ROWS)
     bonuses: tuple[str, ...] = setting(())
-    rns: int = count(10, quick=2)
-    bonus_groups: int = count(10)
-    num_agents: int = count(10, quick=4)
-    max_steps: int = count(5000, quick=1500)
+    rns: Count = setting(10, quick=2)
+    bonus_groups: Count = setting(10)
+    num_agents: Count = setting(10, quick=4)
+    max_steps: Count = setting(5000, quick=1500)
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -63,8 +63,10 @@ class CurveSettings(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        each_of(self.study.rows)("rows", self.rows, None)
-        each_of((*self.study.bonuses, "none"))("bonuses", self.bonuses, None)
+        for row in self.rows:
+            require_known("rows", row, self.study.rows)
+        for bonus in self.bonuses:
+            require_known("bonuses", bonus, (*self.study.bonuses, "none"))
         require(
             self.rns <= self.learned,
             "rns",

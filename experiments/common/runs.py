@@ -17,10 +17,10 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common.experiment import Settings, count, setting
+from experiments.common.experiment import Settings, setting
 from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, require
+from sejax.options import ConfigError, Count, require
 from sejax.runs import run_directory, session, workers
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
@@ -49,7 +49,7 @@ class RunSettings(Settings):
     quick_run: ClassVar[tuple[str, ...]] = ()  # overrides of the NES runs with quick=true
 
     env: str = setting("cartpole")
-    generations: int | None = count(None)
+    generations: Count | None = setting(None)
     preset: str = setting("best")
     run: tuple[str, ...] = setting(())
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Int, PyTree
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.spec import Space
-from sejax.options import Options, counts, option, traced_options
+from sejax.options import Options, WholeNumber, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -196,7 +196,7 @@ class AgentOptions(AgentConfig):
     states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
+    warmup_episodes: WholeNumber = 1
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         return self.warmup_episodes * max_episode_steps

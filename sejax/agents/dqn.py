@@ -7,7 +7,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import optax
 from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
+from pydantic import Field
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
@@ -24,7 +25,7 @@ from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.networks import DuelingMLP, init_narrowed
 from sejax.ops.optimizers import ADAM
-from sejax.options import MOST_LAYERS, counts, fraction, option
+from sejax.options import Count, Fraction, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,10 +40,10 @@ class DDQNConfig(OffPolicyOptions):
       double: the online network chooses a target's action; else the target network
     """
 
-    epsilon_init: float = option(1.0, fraction(), traced=True)
-    epsilon_min: float = option(0.01, fraction(), traced=True)
-    epsilon_decay: float = option(0.9, fraction(), traced=True)
-    exploration_steps: int | None = option(1000, counts("it counts steps"), traced=True)
+    epsilon_init: Fraction = option(1.0, traced=True)
+    epsilon_min: Fraction = option(0.01, traced=True)
+    epsilon_decay: Fraction = option(0.9, traced=True)
+    exploration_steps: Count | None = option(1000, traced=True)
     double: bool = True
 
     @property
@@ -76,9 +77,9 @@ class DuelingDDQNConfig(DDQNConfig):
 
     cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
-    feature_dim: int = option(64, counts())
-    stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
-    stream_hidden_size: int = option(32, counts())
+    feature_dim: Count = 64
+    stream_num_layers: Annotated[int, Field(ge=0, le=100)] = 1
+    stream_hidden_size: Count = 32
 
     def network(self, num_actions: int) -> nn.Module:
         return DuelingMLP(
@@ -97,7 +98,7 @@ class DQNConfig(DDQNConfig):
     """DQN: without double Q-learning."""
 
     double: bool = False
-    epsilon_min: float = 0.05
+    epsilon_min: Fraction = 0.05
 
 
 class DDQNState(struct.PyTreeNode):

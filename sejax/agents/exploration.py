@@ -12,7 +12,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ import optax
 from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
+from pydantic import Field
 
 from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
@@ -27,7 +28,7 @@ from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, Dense
 from sejax.ops.optimizers import ADAM, apply_gradient
-from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
+from sejax.options import Count, Depth, Fraction, NonNegative, Positive, option
 
 
 def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
@@ -70,13 +71,13 @@ class ICMConfig(ExplorationConfig):
 
     states: ClassVar[str | None] = "vector"
 
-    learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
-    forward_weight: float = option(0.05, fraction(), traced=True)
-    reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
-    feature_dim: int = option(32, counts("the models need units"))
-    hidden_size: int = option(128, counts("the models need units"))
-    num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
-    num_residual_blocks: int = option(4, counts("it counts", 0, MOST_LAYERS))
+    learning_rate: Positive = option(1e-5, traced=True)
+    forward_weight: Fraction = option(0.05, traced=True)
+    reward_scale: NonNegative = option(0.03, traced=True)
+    feature_dim: Count = 32
+    hidden_size: Count = 128
+    num_layers: Depth = 2
+    num_residual_blocks: Annotated[int, Field(ge=0, le=100)] = 4
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The same agent, learning from rewards with an intrinsic bonus.
@@ -305,8 +306,8 @@ class CountBasedConfig(ExplorationConfig):
 
     states: ClassVar[str | None] = "discrete"
 
-    reward_scale: float = option(0.1, not_negative("it scales a bonus"), traced=True)
-    count_power: float = option(1.0, positive("the bonus would not fade"))
+    reward_scale: NonNegative = option(0.1, traced=True)
+    count_power: Positive = 1.0
 
     def make(self, agent: Agent, task: Task) -> Agent:
         r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.

@@ -7,7 +7,7 @@ outer loop helps all of them, at the same number of trainings.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
-from sejax.options import Options, one_of, option, require, shortened
+from sejax.options import Options, require, shortened
 from sejax.options.registry import require_part
 
 
@@ -30,7 +30,7 @@ class MixtureConfig(Options):
 
     group: ClassVar[str] = "agents"
 
-    aggregate: str = option("mean", one_of(("mean", "min")))
+    aggregate: Literal["mean", "min"] = "mean"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,17 +18,7 @@ from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Lear
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops.networks import MLP
 from sejax.ops.optimizers import apply_gradient
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    MOVES,
-    counts,
-    fraction,
-    one_of,
-    option,
-    positive,
-    require,
-)
+from sejax.options import Activation, Count, Depth, Fraction, Positive, option, require
 
 Params = TypeVar("Params")  # a pytree
 
@@ -49,14 +39,14 @@ class OffPolicyOptions(AgentOptions):
       discount: gamma
     """
 
-    batch_size: int = option(64, counts(), varied="triple")
-    buffer_size: int = option(100_000, counts())
-    hidden_size: int = option(64, counts(), varied="triple")
-    num_layers: int = option(1, counts(most=MOST_LAYERS), varied="one_more_or_less")
-    activation: str = option("relu", one_of(ACTIVATIONS))
-    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")
-    tau: float = option(0.01, fraction(), traced=True)
-    discount: float = option(0.99, fraction(), traced=True)
+    batch_size: Count = option(64, varied="triple")
+    buffer_size: Count = 100_000
+    hidden_size: Count = option(64, varied="triple")
+    num_layers: Depth = option(1, varied="one_more_or_less")
+    activation: Activation = "relu"
+    learning_rate: Positive = option(1e-3, traced=True, varied="triple")
+    tau: Fraction = option(0.01, traced=True)
+    discount: Fraction = option(0.99, traced=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,8 +72,8 @@ class ActorCriticOptions(OffPolicyOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    learning_rate: float = 3e-3
-    action_repeat: int = option(1, counts())
+    learning_rate: Positive = 3e-3
+    action_repeat: Count = 1
 
     def spec(self) -> AgentSpec:
         return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)

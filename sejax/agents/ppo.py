@@ -17,7 +17,7 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -34,16 +34,14 @@ from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import clip_by_global_norm, scale_by_adam
 from sejax.options import (
-    ACTIVATIONS,
     LARGEST,
-    MOST_LAYERS,
-    MOVES,
-    counts,
-    fraction,
-    not_negative,
-    one_of,
+    Activation,
+    Count,
+    Depth,
+    Fraction,
+    NonNegative,
+    Positive,
     option,
-    positive,
     require,
 )
 
@@ -73,25 +71,25 @@ class PPOConfig(AgentOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    hidden_size: int = option(64, counts(), varied="triple")
-    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
-    activation: str = option("tanh", one_of(ACTIVATIONS))
-    learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
-    discount: float = option(0.99, fraction(), traced=True)
-    rollout_steps: int | None = option(128, counts())
-    update_episodes: int = option(10, counts())
-    epochs: int = option(10, counts())
-    num_minibatches: int = option(4, counts())
-    advantages: str = option("gae", one_of(("monte_carlo", "gae")))
-    gae_lambda: float = option(0.9, fraction(), traced=True)
-    clip_ratio: float = option(0.1, positive(MOVES), traced=True)
-    value_weight: float = option(0.5, not_negative(), traced=True)
-    entropy_weight: float = option(0.01, not_negative(), traced=True)
+    hidden_size: Count = option(64, varied="triple")
+    num_layers: Depth = option(2, varied="one_more_or_less")
+    activation: Activation = "tanh"
+    learning_rate: Positive = option(2e-3, traced=True, varied="triple")
+    discount: Fraction = option(0.99, traced=True)
+    rollout_steps: Count | None = 128
+    update_episodes: Count = 10
+    epochs: Count = 10
+    num_minibatches: Count = 4
+    advantages: Literal["monte_carlo", "gae"] = "gae"
+    gae_lambda: Fraction = option(0.9, traced=True)
+    clip_ratio: Positive = option(0.1, traced=True)
+    value_weight: NonNegative = option(0.5, traced=True)
+    entropy_weight: NonNegative = option(0.01, traced=True)
     normalize_rewards: bool = True
-    max_grad_norm: float | None = option(0.5, positive(MOVES))
-    adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
-    init_action_std: float = option(0.5, positive(MOVES))
-    action_repeat: int = option(1, counts())
+    max_grad_norm: Positive | None = 0.5
+    adam_eps: Positive = 1e-5
+    init_action_std: Positive = 0.5
+    action_repeat: Count = 1
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:

@@ -26,7 +26,7 @@ from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops.networks import init_narrowed
 from sejax.ops.optimizers import ADAM
-from sejax.options import finite, fraction, not_negative, option, positive, require, shortened
+from sejax.options import Finite, Fraction, NonNegative, Positive, option, require, shortened
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
@@ -50,10 +50,10 @@ class SACConfig(ActorCriticOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
-    init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
-    target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
-    target_entropy_fraction: float = option(0.2, fraction(), traced=True)
+    alpha: NonNegative | None = option(None, traced=True)
+    init_alpha: Positive = option(1.0, traced=True)
+    target_entropy: Finite = option(-1.0, traced=True)
+    target_entropy_fraction: Fraction = option(0.2, traced=True)
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions.

@@ -18,7 +18,7 @@ from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
 from sejax.agents.buffers import BufferMaker, Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
 from sejax.envs.base import Task
-from sejax.options import MOVES, fraction, option, positive
+from sejax.options import Fraction, Positive, WholeNumber, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,12 @@ class QLearningConfig(AgentOptions):
 
     states: ClassVar[str | None] = "discrete"
 
-    warmup_episodes: int = 0
-    learning_rate: float = option(1.0, positive(MOVES), traced=True, varied="tenth_to_one")
-    discount: float = option(0.8, fraction(), traced=True, varied="tenth_to_one")
-    epsilon_init: float = option(0.1, fraction(), traced=True)
-    epsilon_min: float = option(0.1, fraction(), traced=True)
-    epsilon_decay: float = option(0.0, fraction(), traced=True)
+    warmup_episodes: WholeNumber = 0
+    learning_rate: Positive = option(1.0, traced=True, varied="tenth_to_one")
+    discount: Fraction = option(0.8, traced=True, varied="tenth_to_one")
+    epsilon_init: Fraction = option(0.1, traced=True)
+    epsilon_min: Fraction = option(0.1, traced=True)
+    epsilon_decay: Fraction = option(0.0, traced=True)
 
     def spec(self) -> AgentSpec:
         return dataclasses.replace(super().spec(), cpu_num_parallel=None)

@@ -22,7 +22,7 @@ from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, 
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import ADAM
-from sejax.options import MOVES, counts, fraction, not_negative, option, positive
+from sejax.options import Activation, Count, Fraction, NonNegative, Positive, option
 
 _MIN_TEMPERATURE = 1e-6
 
@@ -42,10 +42,10 @@ class TD3Config(ActorCriticOptions):
     unless `noisy_tests` is set.
     """
 
-    policy_delay: int = option(2, counts())
-    action_noise_std: float = option(0.1, not_negative(), traced=True)
-    target_noise_std: float = option(0.2, not_negative(), traced=True)
-    target_noise_clip: float = option(0.5, not_negative(), traced=True)
+    policy_delay: Count = 2
+    action_noise_std: NonNegative = option(0.1, traced=True)
+    target_noise_std: NonNegative = option(0.2, traced=True)
+    target_noise_clip: NonNegative = option(0.5, traced=True)
     noisy_tests: bool = False
 
     def make(self, task: Task) -> Agent:
@@ -73,12 +73,12 @@ class DiscreteTD3Config(TD3Config):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    activation: str = "tanh"
-    learning_rate: float = 1e-3
+    activation: Activation = "tanh"
+    learning_rate: Positive = 1e-3
     layer_norm: bool = True
-    temperature: float = option(1.0, positive(MOVES), traced=True)
-    final_temperature: float = option(0.05, fraction(), traced=True)
-    temperature_steps: int = option(2000, counts())
+    temperature: Positive = option(1.0, traced=True)
+    final_temperature: Fraction = option(0.05, traced=True)
+    temperature_steps: Count = 2000
     one_hot_actions: bool = False
 
     def make(self, task: Task) -> Agent:

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pandas as pd
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from sejax import options
 from sejax.agents import make_agent
 from sejax.distillation.policy_search import Lesson, random_map
 from sejax.envs.base import Task
-from sejax.options import ConfigError, Options, counts, option, registry, require, shortened
+from sejax.options import ConfigError, Count, Options, WholeNumber, registry, require, shortened
 from sejax.proxies.exact import Layer, evaluate, require_vectors
 from sejax.training import TrainingConfig, make_trainer
 
@@ -53,11 +53,11 @@ class CopyConfig(Options):
 
     group: ClassVar[str] = "copy"
 
-    hidden_size: int = option(32, counts("0 is a linear copy", least=0))
-    rounds: int = option(4, counts("a copy is fitted at least once"))
-    episodes: int = option(8, counts("something must be seen"))
-    steps: int = option(5000, counts("a copy is fitted"))
-    agent_steps: int = option(100_000, counts("an agent must train"))
+    hidden_size: WholeNumber = 32
+    rounds: Count = 4
+    episodes: Count = 8
+    steps: Count = 5000
+    agent_steps: Count = 100_000
 
 
 # --- what the user names --------------------------------------------------------------------------
@@ -268,7 +268,7 @@ def fit(
         params.append((jax.random.normal(k, (n_out, n_in)) * n_in**-0.5, jnp.zeros(n_out)))
     optimiser = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, config.steps))
 
-    def loss(params: Any, key: Array) -> Array:
+    def loss(params: PyTree, key: Array) -> Array:
         rows = jax.random.randint(key, (_BATCH_SIZE,), 0, len(inputs))
         outputs, wanted = evaluate(params, inputs[rows]), targets[rows]
         if is_discrete:
@@ -278,7 +278,7 @@ def fit(
         pull = 0.1 * (jnp.tanh(outputs) - wanted) ** 2
         return jnp.mean((clipped - wanted) ** 2 + _OVERSHOOT * (outputs - clipped) ** 2 + pull)
 
-    def step(carry: Any, key: Array) -> tuple[Any, None]:
+    def step(carry: PyTree, key: Array) -> tuple[Any, None]:
         params, state = carry
         updates, state = optimiser.update(jax.grad(loss)(params, key), state)
         return (optax.apply_updates(params, updates), state), None

@@ -30,7 +30,7 @@ from sejax.envs.base import Task
 from sejax.evaluation import Steps, Tests, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
 from sejax.ops.scores import or_lowest_finite
-from sejax.options import Options, counts, finite, not_negative, option, positive, require
+from sejax.options import Count, Finite, NonNegative, Options, Positive, require
 from sejax.proxies.exact import Layer, require_vectors
 from sejax.runs.store import Store
 
@@ -63,18 +63,18 @@ class SearchConfig(Options):
 
     group: ClassVar[str] = "search"
 
-    generations: int = option(100, counts("something must be searched"))
-    num_starts: int = option(3, counts("a search begins"))
-    start_generations: int = option(40, counts("a start must be tried"))
-    num_directions: int = option(32, counts("something must be tried"))
-    num_top: int = option(16, counts("something must be learned from"))
-    noise_std: float = option(0.03, positive("directions must differ"))
-    step_size: float = option(0.02, positive("the policy would not move"))
-    constant: float = option(0.5, not_negative("it is a share of the generations"))
-    policy_error: float = option(0.1, not_negative("it is a size"))
-    alive_bonus: float = option(0.0, finite("it is a reward"))
-    num_tests: int = option(5, counts("a policy must be tested"))
-    test_every: int = option(10, counts("it counts generations"))
+    generations: Count = 100
+    num_starts: Count = 3
+    start_generations: Count = 40
+    num_directions: Count = 32
+    num_top: Count = 16
+    noise_std: Positive = 0.03
+    step_size: Positive = 0.02
+    constant: NonNegative = 0.5
+    policy_error: NonNegative = 0.1
+    alive_bonus: Finite = 0.0
+    num_tests: Count = 5
+    test_every: Count = 10
     until_solved: bool = False
 
     def __post_init__(self) -> None:

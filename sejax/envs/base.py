@@ -76,8 +76,7 @@ class Task(TaskSpec):
         try:
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
-            max_steps = options.as_python(limit)
-            options.counts()("env.max_steps", max_steps, 200)
+            max_steps = options.checked([limit], options.Count, "env.max_steps", 200)
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)
@@ -93,7 +92,7 @@ class Task(TaskSpec):
             raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
             message = f"env must be a gymnax 1.x environment with EnvParams; {raised}"
             raise options.ConfigError(message, "env") from error
-        known = {"env": vectors, "params": params, "max_steps": int(max_steps)}
+        known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.spec import Discrete, TaskSpec
-from sejax.options import Options, finite, option
+from sejax.options import Finite, Options
 
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 CLIFF_WALKING = (
@@ -121,7 +121,7 @@ class CliffWalking(Options):
         observation=Discrete(48), action=Discrete(4), max_steps=50, solved_reward=-20.0
     )
 
-    goal_reward: float = option(0.0, finite("it is a reward"))
+    goal_reward: Finite = 0.0
 
     def make(self) -> Task:
         rewards = {"step_reward": -1.0, "goal_reward": self.goal_reward, "hole_reward": -100.0}

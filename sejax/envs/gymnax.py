@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from sejax import options
 from sejax.envs.base import Task
-from sejax.options import Options, counts, option, require, shortened
+from sejax.options import Count, Options, require, shortened
 
 PREFIX = "gymnax/"
 # Gymnasium's registry defines when these count as solved; it has no threshold for the others.
@@ -38,7 +38,7 @@ class GymnaxTask(Options):
 
     name: str = f"{PREFIX}CartPole-v1"
     solved_reward: float | None = None
-    max_steps: int | None = option(None, counts("an episode has steps"))
+    max_steps: Count | None = None
 
     def make(self) -> Task:
         got = f"got {shortened(self.name)}. Other suites are in an example now"

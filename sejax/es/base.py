@@ -2,17 +2,21 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
+from pydantic import Field
 
 from sejax.ops.scores import finite_mean
-from sejax.options import MOST_MEMBERS, Options, counts, one_of, option
+from sejax.options import LEAST, Count, Options
 
-MAX_SCALE = 1e6  # larger steps or noise lead to weights whose products are not finite
+# A number of candidates, each with the weights of a proxy.
+PopulationSize = Annotated[int, Field(ge=2, le=100_000)]
+# Larger steps or noise lead to weights whose products are not finite.
+Scale = Annotated[float, Field(ge=LEAST, le=1e6)]
 
 T = TypeVar("T")
 StrategyState: TypeAlias = PyTree  # only the strategy reads it
@@ -133,9 +137,9 @@ class StrategyOptions(Options):
 
     group: ClassVar[str] = "es"
 
-    population_size: int = option(16, counts("scores are compared", 2, MOST_MEMBERS))
-    num_evals: int = option(1, counts("a candidate needs a score"))
-    eval_aggregate: str = option("mean", one_of(("mean", "min")))
+    population_size: PopulationSize = 16
+    num_evals: Count = 1
+    eval_aggregate: Literal["mean", "min"] = "mean"
     common_random_numbers: bool = False
 
     def evaluations(self, num_incumbent_evals: int) -> Evaluations:

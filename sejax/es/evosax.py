@@ -11,8 +11,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import MAX_SCALE, Evaluations, Strategy, StrategyOptions, StrategyState
-from sejax.options import counts, one_of, option, positive, require, shrinks
+from sejax.es.base import (
+    Evaluations,
+    PopulationSize,
+    Scale,
+    Strategy,
+    StrategyOptions,
+    StrategyState,
+)
+from sejax.options import Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
@@ -45,15 +52,16 @@ class EvosaxConfig(StrategyOptions):
       step_size: Learning rate of Adam on the mean, of open_es and pgpe.
     """
 
-    name: str = option("open_es", one_of(ALGORITHMS))
-    population_size: int = 32
-    num_incumbent_evals: int = option(16, counts("the score of the search mean selects the proxy"))
-    noise_std: float = option(0.05, positive("candidates must differ", MAX_SCALE))
-    noise_std_decay: float = option(1.0, shrinks())
-    step_size: float = option(0.05, positive("the mean would not move", MAX_SCALE))
+    name: str = "open_es"
+    population_size: PopulationSize = 32
+    num_incumbent_evals: Count = 16
+    noise_std: Scale = 0.05
+    noise_std_decay: Decay = 1.0
+    step_size: Scale = 0.05
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_known("es.name", self.name, ALGORITHMS)
         size, field = self.population_size, "es.population_size"
         require(size % 2 == 0, field, f"must be even; got {size}. Set {field}={size + 1}.")
 

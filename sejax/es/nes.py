@@ -5,16 +5,17 @@ Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/refere
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.es.base import MAX_SCALE, Strategy, StrategyOptions
+from sejax.es.base import PopulationSize, Scale, Strategy, StrategyOptions
 from sejax.es.score_transforms import OwnTransform, require_transform, transform_of
 from sejax.ops.scores import or_minus_inf
-from sejax.options import counts, fraction, one_of, option, positive, shrinks
+from sejax.options import Count, Decay, Fraction, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,18 +40,20 @@ class NESConfig(StrategyOptions):
       weight_decay: psi shrinks by this before each update
     """
 
-    population_size: int = 64
-    num_incumbent_evals: int | None = option(
-        16, counts("the score of the search mean selects the proxy")
-    )
-    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE))
-    noise_std_decay: float = option(0.97, shrinks())
-    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE))
-    step_size_decay: float = option(1.0, shrinks())
+    population_size: PopulationSize = 64
+    num_incumbent_evals: Count | None = 16
+    noise_std: Scale = 0.06
+    noise_std_decay: Decay = 0.97
+    step_size: Scale = 1.0
+    step_size_decay: Decay = 1.0
     mirrored: bool = True
-    score_transform: str | OwnTransform = option("all_better_2", require_transform, names_code=True)
-    update_rule: str = option("authors", one_of(("authors", "paper")))
-    weight_decay: float = option(0.0, fraction())
+    score_transform: str | OwnTransform = option("all_better_2", names_code=True)
+    update_rule: Literal["authors", "paper"] = "authors"
+    weight_decay: Fraction = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_transform(self.score_transform)
 
     def make(self, num_dims: int) -> Strategy:
         r"""NES over vectors `[num_dims]`.

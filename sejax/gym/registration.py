@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
-from sejax.options import ConfigError, as_python, counts, registry
+from sejax.options import ConfigError, Count, checked, registry
 from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _read(
     Raises:
       ConfigError: as `make`.
     """
-    counts("each is an episode at a time")("num_envs", as_python(num_envs), 8)
+    checked([num_envs], Count, "num_envs", 8)
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None

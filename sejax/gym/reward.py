@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from sejax import envs
 from sejax.gym import networks
 from sejax.gym.tasks import Env, Info, RealTask
-from sejax.options import as_python, fraction, registry, require, shortened
+from sejax.options import Fraction, checked, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, read
 from sejax.proxies.reward import RewardConfig
@@ -60,9 +60,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
-        discount = as_python(header.discount if discount is None else discount)
-        fraction()("discount", discount, header.discount)
-        self.discount = float(discount)
+        discount = header.discount if discount is None else discount
+        self.discount = checked([discount], Fraction, "discount", header.discount)
         weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()
         if weighs_info or self.config.augmented:  # of which the task's configuration tells
             spec = envs.spec_of(configured("env", header.config["env"], header.task))
@@ -107,7 +106,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info
 
-    def potential(self, obs: Any, info_values: np.ndarray | tuple[()] = ()) -> float:
+    def potential(self, obs: np.ndarray, info_values: np.ndarray | tuple[()] = ()) -> float:
         """Phi of an observation, and of the numbers of `info` that the network sees."""
         if self._table is not None:
             return self._table[obs]
@@ -120,7 +119,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         outputs = networks.forward(self._layers, self.config.activation, x)
         return self.config.output_scale * outputs[..., 0]
 
-    def _bonus(self, obs: Any, info_values: np.ndarray, terminated: bool) -> float:
+    def _bonus(self, obs: np.ndarray, info_values: np.ndarray, terminated: bool) -> float:
         """What a transition is worth beside the real reward."""
         if self._weights is not None:
             return float(self._weights @ info_values)

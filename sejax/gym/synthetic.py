@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sejax.envs.spec import Box
 from sejax.gym import networks
 from sejax.gym.tasks import Info, RealTask
-from sejax.options import one_of, require
+from sejax.options import require, require_known
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import check_tensors
 from sejax.proxies.synthetic import SyntheticConfig
@@ -241,7 +241,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self.world = world
         self.num_envs = num_envs
         mode = str(getattr(autoreset_mode, "value", autoreset_mode))
-        one_of(["NextStep", "SameStep"])("autoreset_mode", mode, None)
+        require_known("autoreset_mode", mode, ["NextStep", "SameStep"])
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode(mode)}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space

@@ -5,7 +5,7 @@ that an agent would learn other weights on two devices than on one (a slow test 
 `tests/test_run.py`). Here numbers are inverted first. The plain forms are optax's.
 """
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def scale_by_adam(eps: float = 1e-8) -> optax.GradientTransformation:
     plain = optax.scale_by_adam(*_DECAYS, eps=eps)
 
     def update(
-        gradient: optax.Updates, state: Any, params: optax.Params | None = None
+        gradient: optax.Updates, state: optax.ScaleByAdamState, params: optax.Params | None = None
     ) -> tuple[optax.Updates, optax.OptState]:
         mean = optax.tree.update_moment(gradient, state.mu, _DECAYS[0], 1)
         square = optax.tree.update_moment_per_elem_norm(gradient, state.nu, _DECAYS[1], 2)

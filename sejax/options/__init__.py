@@ -1,10 +1,10 @@
 """Options: the fields of a configuration, their checks, and the errors that bad input raises.
 
 A configuration is a frozen dataclass that can make what it configures. Each of its fields is
-written once: name, type, default, and the rule that a value must obey. What the docstring says of
-a field under `Attributes:` is the text of `--help`.
+written once: name, type with its bounds, default. Pydantic checks and converts a value. What the
+docstring says of a field under `Attributes:` is the text of `--help`.
 
-Every message has one form: the field, what must hold, why, what came, and how to fix it.
+Every message has one form: the field, what must hold, what came, and how to fix it.
 
 Example:
   >>> @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,11 +16,11 @@ Example:
   ...     '''
   ...
   ...     group: ClassVar[str] = "agent"
-  ...     batch_size: int = option(128, counts())
+  ...     batch_size: Count = 128
   >>> Config(batch_size=0)
   Traceback (most recent call last):
-  sejax.options.ConfigError: agent.batch_size must be a whole number from 1 to 2147483647, because \
-there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=128.
+  sejax.options.ConfigError: agent.batch_size must be greater than or equal to 1; got 0. Set \
+agent.batch_size=128.
 """
 
 import contextlib
@@ -32,24 +32,17 @@ import re
 import sysconfig
 import textwrap
 import traceback
-import types
 import typing
 from collections import ChainMap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Any, ClassVar, TypeGuard, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeGuard
 
-ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
-MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
-NOTHING = "there is nothing to learn from or with otherwise"
-MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
-MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
+from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
+
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 MOST, LEAST = 1e30, 1e-30  # of numbers that programs compute with in 32 bits
-
-T = TypeVar("T")
-Rule = Callable[[str, T, T | None], None]  # (name, value, default) -> None, or raises ConfigError
 
 
 # --- errors --------------------------------------------------------------------------------------
@@ -154,31 +147,45 @@ _LIBRARIES = (
 # --- fields --------------------------------------------------------------------------------------
 
 
+# A whole number from 1.
+Count = Annotated[int, Field(ge=1, le=LARGEST)]
+# A whole number from 0.
+WholeNumber = Annotated[int, Field(ge=0, le=LARGEST)]
+# A number of layers, which are traced one by one.
+Depth = Annotated[int, Field(ge=1, le=100)]
+# A number above 0 with which programs can compute in 32 bits.
+Positive = Annotated[float, Field(ge=LEAST, le=MOST)]
+# A finite number from 0.
+NonNegative = Annotated[float, Field(ge=0, le=MOST)]
+# A finite number, of either sign.
+Finite = Annotated[float, Field(ge=-MOST, le=MOST)]
+# A number in [0, 1].
+Fraction = Annotated[float, Field(ge=0, le=1)]
+# A factor in (0, 1] by which something shrinks each generation.
+Decay = Annotated[float, Field(ge=LEAST, le=1)]
+# A name of `sejax.ops.networks`.
+Activation = Literal["tanh", "fast_tanh", "relu", "leaky_relu", "prelu"]
+
+
 def option(
-    default: Any = dataclasses.MISSING,
-    rule: Rule[T] | None = None,
-    *,
-    traced: bool = False,
-    varied: str | None = None,
-    names_code: bool = False,
+    default: Any, *, traced: bool = False, varied: str | None = None, names_code: bool = False
 ) -> Any:
-    """A dataclass field.
+    """A dataclass field that is marked.
 
     Args:
-      default: its default; without one it must be given.
-      rule: what must hold; None passes it where that is the default or `... | None` the type.
+      default: its default.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
       names_code: whether its text may be a `module:attribute`, which no file may name.
     """
-    metadata = {"rule": rule, "traced": traced, "varied": varied, "names_code": names_code}
+    metadata = {"traced": traced, "varied": varied, "names_code": names_code}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """A dataclass whose fields check themselves.
+    """A dataclass whose fields are checked by their types, such as `Count`.
 
     `group` is where the command line has them.
     """
@@ -186,23 +193,76 @@ class Options:
     group: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """Checks all fields that have a rule.
+        """Checks and converts all fields: numbers of NumPy and jax become Python's.
 
-        Numbers of NumPy and jax become Python's, and whole numbers floats where the default is one,
-        so that equal configurations are the same program.
+        So equal configurations are the same program.
 
         Raises:
-          ConfigError: for the first one that does not hold.
+          ConfigError: for the first value that does not fit its field's type.
         """
+        hints = hints_of(type(self), self.group)
         for field in dataclasses.fields(self):
-            value = as_python(getattr(self, field.name))
-            if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
-                value = float(value)
+            name = f"{self.group}.{field.name}".lstrip(".")
+            value = getattr(self, field.name)
+            value = checked([value], hints[field.name], name, field.default)
             object.__setattr__(self, field.name, value)
-            rule = marks(type(self), field.name).get("rule")
-            may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
-            if rule is not None and not (value is None and may_be_none):
-                rule(f"{self.group}.{field.name}".lstrip("."), value, field.default)
+
+
+def hints_of(cls: type, where: str) -> dict[str, Any]:
+    """The types of a dataclass's fields, with their bounds.
+
+    Raises:
+      ConfigError: for a type that is not known where the class is defined.
+    """
+    try:
+        return typing.get_type_hints(cls, include_extras=True)
+    except NameError as error:
+        raise ConfigError(f"{where} must have fields of known types: {error}.", where) from error
+
+
+def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> Any:
+    """A value as its field's type, to which pydantic converts it.
+
+    Args:
+      candidates: what the value may stand for; the first one that fits counts.
+      hint: the type.
+      name: of the field, for messages.
+      default: of the field; None fits where the default is None.
+
+    Raises:
+      ConfigError: if none fits.
+    """
+    must, got = "", None
+    for got in map(as_python, candidates):
+        if got is None and default is None:
+            return None
+        try:
+            value = _adapter(hint).validate_python(got)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            if typing.get_origin(hint) is Literal:
+                raise unknown_name(name, str(got), typing.get_args(hint)) from None
+            must = problem["msg"].removeprefix("Input should ").partition(", unable")[0]
+        else:
+            if isinstance(got, bool) == isinstance(value, bool):  # bools are numbers in Python
+                return value
+            must = "be no true or false"
+    is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
+    fix = "VALUE" if is_open else as_text(default)
+    raise ConfigError(f"{name} must {must}; got {shortened(repr(got))}. Set {name}={fix}.", name)
+
+
+@functools.cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    if dataclasses.is_dataclass(hint):  # which pydantic would make of a dictionary
+        return TypeAdapter(InstanceOf[hint])
+    return TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+
+
+def require_known(field: str, value: object, known: Collection[str]) -> None:
+    """Raises `ConfigError` unless the value is one of these names."""
+    if value not in known:
+        raise unknown_name(field, str(value), known)
 
 
 def traced_options(config: Options) -> dict[str, Any]:
@@ -266,9 +326,6 @@ def as_python(value: Any) -> Any:
         return value
 
 
-# --- rules ---------------------------------------------------------------------------------------
-
-
 def as_text(value: object) -> str:
     """A value as the command line takes it.
 
@@ -282,63 +339,3 @@ def as_text(value: object) -> str:
         return "null" if value is None else str(value).lower()
     text = str(value)
     return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
-
-
-def between(
-    low: float, high: float, reason: str, must: str = "", is_whole: bool = False
-) -> Rule[float]:
-    """A number from `low` to `high`, and a whole one with `is_whole`."""
-    must = must or f"lie between {low:g} and {high:g}"
-
-    def apply(name: str, value: float, default: float | None) -> None:
-        is_within = is_number(value) and low <= value <= high
-        if not is_within or (is_whole and value != value // 1):
-            got, fix = shortened(value), f"{name}={as_text(default)}"
-            raise ConfigError(f"{name} must {must}, because {reason}; got {got}. Set {fix}.", name)
-
-    return apply
-
-
-def counts(reason: str = NOTHING, least: int = 1, most: int = LARGEST) -> Rule[float]:
-    """A whole number from `least` to `most`."""
-    return between(least, most, reason, f"be a whole number from {least} to {most}", is_whole=True)
-
-
-def not_negative(reason: str = "it is a size") -> Rule[float]:
-    """A finite number from 0 on."""
-    return between(0, MOST, reason)
-
-
-def positive(reason: str, at_most: float = MOST) -> Rule[float]:
-    """A finite number above 0 with which programs can compute in 32 bits."""
-    return between(LEAST, at_most, reason)
-
-
-#: `finite(reason)` is a finite number, of either sign.
-finite = functools.partial(between, -MOST, MOST)
-#: `fraction()` is a number in [0, 1].
-fraction = functools.partial(between, 0, 1, "it is a fraction")
-#: `shrinks()` is a factor in (0, 1].
-shrinks = functools.partial(between, LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
-#: `seed()` is a seed that `jax.random.key` takes as it is.
-seed = functools.partial(between, 0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
-
-
-def one_of(known: Collection[str]) -> Rule[str]:
-    """One of these names."""
-
-    def apply(name: str, value: str, default: str | None) -> None:
-        if value not in known:
-            raise unknown_name(name, str(value), known)
-
-    return apply
-
-
-def each_of(known: Collection[str]) -> Rule[Iterable[str]]:
-    """A list of these names."""
-
-    def apply(name: str, values: Iterable[str], default: Iterable[str] | None) -> None:
-        for value in values:
-            one_of(known)(name, value, None)
-
-    return apply

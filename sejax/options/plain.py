@@ -6,7 +6,6 @@ float, a list for a tuple, the text of an override for a number. Nothing is impo
 """
 
 import dataclasses
-import functools
 import os
 import re
 import typing
@@ -14,12 +13,11 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
-
 from sejax.options import (
     ConfigError,
-    as_text,
+    checked,
     errors_of,
+    hints_of,
     listed,
     marks,
     nearest,
@@ -71,19 +69,14 @@ def from_plain(
     Raises:
       ConfigError: for a field that is not there, is missing, or has a value of another type.
     """
-    try:
-        hints = typing.get_type_hints(cls)
-    except NameError as error:
-        message = f"{where} must have fields of known types: {error}."
-        raise ConfigError(message, where) from error
-    defaults, fields = fields_of(cls), {}
+    hints, defaults, fields = hints_of(cls, where), fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
         if name not in defaults and GONE.get(name, MISSING) == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        if marks(cls, name).get("names_code") and ":" in str(value):
+        if ":" in str(value) and marks(cls, name).get("names_code"):
             require_typed(full[name], str(value), imports)
         fields[name] = _read(value, hints[name], full[name], defaults[name], imports)
     for name, default in defaults.items():
@@ -124,10 +117,9 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
 
 
 def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
-    """A value as its field's type, which pydantic converts; an error says what it must be."""
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        if isinstance(value, hint):
-            return value
+    """A value as its field's type; see `sejax.options.checked`."""
+    is_dataclass = isinstance(hint, type) and dataclasses.is_dataclass(hint)
+    if is_dataclass and not isinstance(value, hint):
         fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
         message = f"must {fields}; got {shortened(repr(value))}. Leave it out."
         require(isinstance(value, Mapping), name, message)
@@ -138,24 +130,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
         candidates = [parsed(expanded(value)), expanded(value)]
     elif type(value) in (int, float):  # or a name of digits, as of a folder
         candidates = [value, str(value)]
-    must = "be no true or false"
-    for candidate in candidates:
-        if candidate is None and default is None:
-            return None
-        try:
-            converted = _adapter(hint).validate_python(candidate)
-        except ValidationError as error:
-            must = error.errors()[0]["msg"].removeprefix("Input should ").partition(", unable")[0]
-        else:  # bools are numbers in Python
-            if isinstance(candidate, bool) == isinstance(converted, bool):
-                return converted
-    is_open = default is MISSING or dataclasses.is_dataclass(default)
-    fix = "VALUE" if is_open else as_text(to_plain(default))
-    raise ConfigError(f"{name} must {must}; got {shortened(repr(value))}. Set {name}={fix}.", name)
-
-
-_CONVERSION = ConfigDict(arbitrary_types_allowed=True)
-_adapter = functools.cache(functools.partial(TypeAdapter, config=_CONVERSION))
+    return checked(candidates, hint, name, default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

@@ -16,7 +16,15 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import LARGEST, ConfigError, is_number, one_of, registry, require, shortened
+from sejax.options import (
+    LARGEST,
+    ConfigError,
+    is_number,
+    registry,
+    require,
+    require_known,
+    shortened,
+)
 from sejax.options.plain import expanded, from_plain
 from sejax.proxies import hub
 
@@ -174,7 +182,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         there = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError(f"{option} {there}; got {shortened(name)}, where there is none.", option)
     if name not in pretrained_names():
-        one_of([*pretrained_names(), *also])(option, shortened(name), None)
+        require_known(option, shortened(name), [*pretrained_names(), *also])
     return PRETRAINED_DIR / f"{name}.safetensors"
 
 

@@ -22,7 +22,7 @@ from sejax.envs.environment import Environment
 from sejax.envs.spec import TaskSpec
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, as_python, one_of, registry, require, shortened, told
+from sejax.options import ConfigError, as_python, registry, require, require_known, shortened, told
 from sejax.options.plain import from_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
@@ -194,7 +194,7 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
     env, config = _stored_env(proxy)
     stored = agents_of(config)
     name = next(iter(stored)) if name is None else name
-    one_of(stored)("name", name, None)
+    require_known("name", name, stored)
     agent = header.configured("agent", stored[name], env.name)
     explored = config.get("exploration", {"name": "none"})
     return make_agent(agent, env.task, header.configured("exploration", explored, env.name))

@@ -7,18 +7,19 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PyTree
+from pydantic import Field
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
 from sejax.envs.spec import TaskSpec
 from sejax.ops.networks import MLP, uniform_fan_in
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive, require
+from sejax.options import Activation, Count, Depth, require, require_known
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv
 
 
@@ -63,16 +64,17 @@ class RewardConfig(ProxyConfig):
     default_objective: ClassVar[str] = "reward_threshold"
     has_real_dynamics: ClassVar[bool] = True
 
-    hidden_size: int = option(64, counts("a layer needs a unit"))
-    num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
-    activation: str = option("prelu", one_of(ACTIVATIONS))
-    variant: str = option("additive_potential", one_of(VARIANTS))
-    output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
+    hidden_size: Count = 64
+    num_layers: Depth = 1
+    activation: Activation = "prelu"
+    variant: str = "additive_potential"
+    output_scale: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     augmented: bool = False
     zero_at_terminal: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_known("proxy.variant", self.variant, VARIANTS)
         defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
         for name, default in defaults.items():
             if getattr(self, name) != default and self.shaping.weighs_info:

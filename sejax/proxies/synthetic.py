@@ -6,7 +6,7 @@ and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Le
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.envs.spec import Box, TaskSpec
 from sejax.ops.networks import MLP
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option
+from sejax.options import Activation, Count, Depth
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams
 
 START_HIDDEN_SIZE = 32  # units of the network that makes initial states
@@ -71,16 +71,16 @@ class SyntheticConfig(ProxyConfig):
         sum of the distances from it, so that the best policy is known.
     """
 
-    hidden_size: int = option(128, counts("a layer needs a unit"))
-    num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
-    activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    done: str = option("threshold", one_of(("soft", "threshold", "bernoulli")))
-    min_steps: int = option(1, counts("an episode has steps"))
-    initial_state: str = option("learned", one_of(("real", "learned", "noise")))
-    state_units: str = option("raw", one_of(("raw", "bounds")))
-    horizon: int | None = option(1, counts("an episode has steps"))
-    reward_form: str = option("network", one_of(("network", "distance")))
-    start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
+    hidden_size: Count = 128
+    num_layers: Depth = 1
+    activation: Activation = "leaky_relu"
+    done: Literal["soft", "threshold", "bernoulli"] = "threshold"
+    min_steps: Count = 1
+    initial_state: Literal["real", "learned", "noise"] = "learned"
+    state_units: Literal["raw", "bounds"] = "raw"
+    horizon: Count | None = 1
+    reward_form: Literal["network", "distance"] = "network"
+    start_hidden_size: Count = START_HIDDEN_SIZE
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,7 +11,9 @@ import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+from pydantic import Field
 
 from sejax import agents, envs
 from sejax.agents.base import AgentConfig, ExplorationConfig
@@ -20,16 +22,14 @@ from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
+    Count,
     Options,
-    between,
-    counts,
+    WholeNumber,
     errors_of,
     field_lines,
-    one_of,
     option,
     registry,
     require,
-    seed,
     shortened,
 )
 from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain, unknown_field
@@ -37,7 +37,6 @@ from sejax.proxies import ProxyConfig, header
 from sejax.runs import compose
 from sejax.training import TrainingConfig, require_reachable
 
-AGENT_HPARAMS = ("default", "varied")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
@@ -59,7 +58,7 @@ class Share(Options):
 
     group: ClassVar[str] = "share"
 
-    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
+    weight: Annotated[float, Field(ge=0, le=1e6)] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +82,9 @@ class CommandConfig(Options):
     agents: dict[str, AgentConfig]
     exploration: ExplorationConfig
     training: TrainingConfig = TRAINING
-    seed: int = option(0, seed())
-    num_parallel: int | None = option(None, counts("something must compute"))
-    devices: int | None = option(None, counts("something must compute"))
+    seed: WholeNumber = 0
+    num_parallel: Count | None = None
+    devices: Count | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -176,8 +175,8 @@ class LearnConfig(CommandConfig):
     groups: ClassVar[tuple[str, ...]] = tuple(compose.DEFAULTS)
     learns: ClassVar[bool] = True
 
-    weights: tuple[float, ...] = option(())
-    mixture: MixtureConfig = option(MixtureConfig())
+    weights: tuple[float, ...] = ()
+    mixture: MixtureConfig = MixtureConfig()
     preset: str = "best"
     env: Any
     proxy: Any
@@ -185,11 +184,11 @@ class LearnConfig(CommandConfig):
     objective: Any
     tracker: Any
     machines: Any
-    agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
-    generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
-    num_seeds: int = option(1, counts("it counts runs"))
+    agent_hparams: Literal["default", "varied"] = "default"
+    generations: Count = 100
+    num_seeds: Count = 1
     stop_when_solved: bool = False
-    checkpoint_every: int = option(1, counts("it counts generations"))
+    checkpoint_every: Count = 1
     run_dir: str | None = None
 
     def __post_init__(self) -> None:
@@ -269,9 +268,9 @@ class EvaluateConfig(CommandConfig):
     proxy: str
     env: str | None = option(None, names_code=True)
     proxy_kind: str | None = option(None, names_code=True)
-    agent_hparams: str = option("default", one_of((*AGENT_HPARAMS, "as_learned")))
-    training_from: str = option("proxy", one_of(("proxy", "config")))
-    num_agents: int = option(10, counts("there is nothing to average otherwise"))
+    agent_hparams: Literal["default", "varied", "as_learned"] = "default"
+    training_from: Literal["proxy", "config"] = "proxy"
+    num_agents: Count = 10
     baseline: bool = True
     out_dir: str | None = None
     real_training: TrainingConfig = REAL_TRAINING

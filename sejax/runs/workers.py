@@ -29,7 +29,7 @@ from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import ConfigError, FailedError, Options, counts, option, shortened, told
+from sejax.options import ConfigError, Count, FailedError, Options, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
@@ -120,7 +120,7 @@ class RayConfig(Options):
     package: ClassVar[str] = "ray"
 
     address: str | None = None
-    workers: int | None = option(None, counts("somebody must compute"))
+    workers: Count | None = None
 
     @contextlib.contextmanager
     def make(self, config: LearnConfig) -> Iterator["RemoteChunks"]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from sejax.ops.files import as_file_name
-from sejax.options import Options, counts, option, registry, require, shortened
+from sejax.options import Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs import config as configuration
@@ -43,15 +43,15 @@ class StudyConfig(Options):
 
     group: ClassVar[str] = ""
 
-    trials: int = option(60, counts("there is nothing to compare otherwise"))
-    min_generations: int = option(3, counts("a trial must show something"))
-    max_generations: int = option(27, counts("there is nothing to do otherwise"))
-    seeds: int = option(1, counts("a trial needs a run"))
+    trials: Count = 60
+    min_generations: Count = 3
+    max_generations: Count = 27
+    seeds: Count = 1
     space: str | None = None
     study: str | None = None
     search_dir: str | None = None
-    verify: int = option(5, counts("the best are tried again", least=0))
-    fresh_seeds: int = option(5, counts("the best are tried again with them"))
+    verify: WholeNumber = 5
+    fresh_seeds: Count = 5
 
     def __post_init__(self) -> None:
         super().__post_init__()

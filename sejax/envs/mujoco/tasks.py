@@ -13,7 +13,7 @@ import math
 import warnings
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +23,13 @@ from jaxtyping import Array, Bool, Float
 from sejax.envs.base import Task
 from sejax.envs.mujoco.environment import MujocoTask, Scalars
 from sejax.envs.spec import Box, TaskSpec
-from sejax.options import ConfigError, finite, not_negative, one_of, option
+from sejax.options import ConfigError, Finite, NonNegative
 
 if TYPE_CHECKING:  # it imports mujoco
     from sejax.envs.mujoco.physics import Report
 
 # Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
 # MuJoCo, at ten times its cost on a CPU (docs/mujoco.md).
-BACKENDS = ("mujoco", "mjx", "spring")
 
 # The entries of `info` that describe the state alone; an observation has no position along x or y.
 _STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
@@ -82,7 +81,7 @@ class HalfCheetah(MujocoTask):
     otherwise = ", or set env.backend=mjx"
     spec = _spec(17, 6, solved_reward=3000.0, info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"))
 
-    backend: str = option("mujoco", one_of(BACKENDS))
+    backend: Literal["mujoco", "mjx", "spring"] = "mujoco"
 
     def make(self) -> Task:
         if self.backend == "mujoco":
@@ -110,9 +109,9 @@ class HalfCheetah(MujocoTask):
 class Runner(MujocoTask):
     """What the tasks have in common that pay for moving along x and charge for torque."""
 
-    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
-    ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
-    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+    forward_reward_weight: Finite = 1.0
+    ctrl_cost_weight: NonNegative = 1e-3
+    reset_noise_scale: NonNegative = 0.1
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
         return {
@@ -148,9 +147,9 @@ class Hopper(Runner):
     frame_skip = 4
     spec = _spec(11, 3, solved_reward=3800.0, info_keys=_INFO_OF_WALKERS)
 
-    healthy_reward: float = option(1.0, finite("it is a reward"))
+    healthy_reward: Finite = 1.0
     terminate_when_unhealthy: bool = True
-    reset_noise_scale: float = 5e-3
+    reset_noise_scale: NonNegative = 5e-3
 
     def observe(self, now: "Report") -> Float[Array, " obs_dim"]:
         return jnp.concatenate([now.qpos[1:], jnp.clip(now.qvel, -10, 10)])
@@ -209,7 +208,7 @@ class Swimmer(Runner):
     num_hidden = 2
     spec = _spec(8, 2, solved_reward=360.0, info_keys=_INFO_IN_A_PLANE)
 
-    ctrl_cost_weight: float = 1e-4
+    ctrl_cost_weight: NonNegative = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +225,7 @@ class InvertedPendulum(MujocoTask):
     num_hidden = 0
     spec = dataclasses.replace(_spec(4, 1, solved_reward=950.0), action=Box.symmetric(3.0))
 
-    reset_noise_scale: float = option(0.01, not_negative("it is a range"))
+    reset_noise_scale: NonNegative = 0.01
 
     def is_healthy(self, now: "Report") -> Bool[Array, ""]:
         return jnp.isfinite(self.observe(now)).all() & (jnp.abs(now.qpos[1]) <= 0.2)
@@ -260,9 +259,9 @@ class Ant(Runner):
     with_forces = True
     normal_velocities = True
 
-    ctrl_cost_weight: float = 0.5
-    contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
-    healthy_reward: float = option(1.0, finite("it is a reward"))
+    ctrl_cost_weight: NonNegative = 0.5
+    contact_cost_weight: NonNegative = 5e-4
+    healthy_reward: Finite = 1.0
     terminate_when_unhealthy: bool = True
     include_cfrc_ext_in_observation: bool = True
 
@@ -320,8 +319,8 @@ class Reacher(MujocoTask):
         _spec(10, 2, solved_reward=-3.75, info_keys=("reward_dist", "reward_ctrl")), max_steps=50
     )
 
-    reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
-    reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))
+    reward_dist_weight: NonNegative = 1.0
+    reward_control_weight: NonNegative = 1.0
 
     def draw_start(self, key: Array) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
         key_arm, key_speed, key_distance, key_angle = jax.random.split(key, 4)
