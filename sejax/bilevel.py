@@ -130,8 +130,8 @@ class Bilevel:
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
-        Of equally good incumbents the last one is kept: where the task's highest return ends the
-        comparison, the search goes on to weights that teach under perturbation too.
+        Of equally good incumbents the last one is kept. Once incumbents reach the task's highest
+        return, the search still moves to weights that teach under perturbation too.
         """
         # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
         outcome = jax.lax.optimization_barrier(outcome)

@@ -162,7 +162,8 @@ def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = 
 
 def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
     task, folder = config.task(), store.folder
-    uses = ("search", "nothing", "record", CHOOSE, TEST)  # policies are tested by the last one too
+    # Policies are tested by the last key, too. "nothing" keeps the numbers of stored proxies.
+    uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if job.policy is None:
         lessons, costs = searched(job.search, task, job.num_snapshots, keys, store, config.devices)

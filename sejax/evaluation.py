@@ -219,7 +219,7 @@ def make_evaluator(
     """
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_part("training", TrainingConfig, training)
-    budget = max(training.max_steps or LARGEST, 1000)  # what is as short is a trial
+    budget = max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
     must = f"must end a test episode within 1,000 times the training budget of {training.max_steps}"
     got = f"because an agent may never end it; got {task.max_steps:,} for {task.name}"
     message = f"{must} steps, {got}. Set env.max_steps=N, or Task(max_steps=N)."

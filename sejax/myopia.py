@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 
 MARGIN = 0.1
 LEVEL = 0.95
-LEAST = 5  # independent values of an interval: the range of two holds the median half of the time
+LEAST = 5  # independent values that an interval needs
 NONE = (math.nan, math.nan)  # of fewer
 
 

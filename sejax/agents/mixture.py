@@ -24,8 +24,7 @@ class MixtureConfig(Options):
     """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line.
 
     Attributes:
-      aggregate: The search mean's score, given that with each agent: the mean of those, or the
-        worst.
+      aggregate: Each agent scores the search mean; its score is the mean of theirs, or the worst.
     """
 
     group: ClassVar[str] = "agents"

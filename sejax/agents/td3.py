@@ -228,12 +228,12 @@ class TD3(ActorCritic):
         )
 
     def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "action_dim *batch"]:
-        """The actor's."""
+        """The actor's outputs."""
         outputs: Any = self.actor.apply(actor, obs)
         return outputs
 
     def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
-        """Of one of the critics."""
+        """What one critic says an action is worth."""
         values: Any = self.critic.apply(critic, jnp.concatenate([obs, action]))
         return values[0]
 

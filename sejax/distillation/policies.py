@@ -112,7 +112,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
         import stable_baselines3
 
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
-    except Exception as error:  # whatever lacks where another algorithm looks for it
+    except Exception as error:  # of any kind: the file, the algorithm or the library
         got = f"got {shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
         message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
         raise ConfigError(message, "policy") from error
@@ -152,6 +152,7 @@ def copied(
     require_vectors(task)
     started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
+    # The unused key keeps the numbers of stored proxies.
     key, key_visit, _, key_fit = jax.random.split(key, 4)
     policy_states, policy_return = visit(task, act, key_visit, config.episodes)
     scale = policy_states.mean(0), np.maximum(policy_states.std(0), 1e-2)

@@ -29,8 +29,8 @@ def make(
       source: a run directory, a safetensors file of one proxy, or the name of one that ships with
         the package.
       task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
-        both know. Episodes of an SE keep the step limit in its file. For an RN an id;
-        `RewardNetwork` goes around any environment.
+        both know. Episodes of an SE keep the step limit in its file. An RN needs an id here;
+        `RewardNetwork` wraps any environment.
       render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
         it.
 

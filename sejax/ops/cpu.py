@@ -18,15 +18,16 @@ SMALL_NUM_PARALLEL = 8
 # columns: enough to waste little, large enough for efficient products.
 NUM_BLOCKS, MIN_BLOCK = 4, 32
 
-# Sizes of networks that varied agents choose from, for one hidden layer and for more. What room to
-# spare costs grows with the size of one layer, and with the square of the size of more.
+# Numbers of network sizes that varied agents choose from, for one hidden layer and for more. Units
+# that are switched off cost time: in proportion to the size of one layer, to its square with more.
 NUM_SIZES, NUM_SIZES_DEEP = 6, 12
 
 
 def width_of(num_agents: int) -> int:
-    """The widest batch, a power of two, of which few agents fill two: one on each of two devices.
+    """The width of a batch, a power of two: the widest with which so many agents fill two batches.
 
-    A batch is filled up with copies, which would cost eight agents the time of sixteen.
+    Two batches keep two devices busy. A last batch is filled up with copies, so a width of 16 would
+    cost eight agents the time of sixteen.
 
     Example:
       >>> [width_of(num_agents) for num_agents in (1, 4, 8, 20)]

@@ -9,8 +9,8 @@ _TIE = 1e-6  # of the score that others are compared with, or of 1 where that is
 def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "*n"]:
     """Whether scores are equal to another one but for rounding.
 
-    In single precision the mean of equal scores may be a few last digits off, whose share of each
-    other would be weights as large as any. The authors' code asks for a difference of 1e-6.
+    In single precision the mean of equal scores may differ from them in its last digits. Divided by
+    each other, such differences would be large weights. The authors' code asks for 1e-6 as well.
     """
     return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
 

@@ -28,8 +28,7 @@ from sejax.options import (
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
-# Fields of earlier versions, with the only value that a file may still give them: what is computed
-# without them.
+# Fields of earlier versions. A file may still give them this value, with which nothing changes.
 GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
 GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
 GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
@@ -76,7 +75,7 @@ def from_plain(
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        if ":" in str(value) and marks(cls, name).get("names_code"):
+        if isinstance(value, str) and ":" in value and marks(cls, name).get("names_code"):
             require_typed(full[name], str(value), imports)
         fields[name] = _read(value, hints[name], full[name], defaults[name], imports)
     for name, default in defaults.items():

@@ -45,7 +45,7 @@ T_co = TypeVar("T_co", covariant=True)
 
 @runtime_checkable
 class Makes(Protocol[T_co]):
-    """A configuration that makes a part, of a task or of whatever such a part is for."""
+    """A configuration that makes a part, such as an agent for a task."""
 
     @property
     def make(self) -> Callable[..., T_co]: ...

@@ -35,7 +35,8 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
 KIND = "sejax"  # of the metadata's entry
-UNSAID = {"training": {"time_limit_is_terminal": True}}  # was the default of what a file left out
+# The default at the time of files that do not say it.
+UNSAID = {"training": {"time_limit_is_terminal": True}}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -208,6 +208,7 @@ class SyntheticEnv(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
+        # Always a key for "start", too, so that stored runs keep their numbers.
         keys = jax.random.split(key, len(self._networks.keys() | {"start"}))
         return {
             name: self._net(name).init(network_key, jnp.zeros(units[0]))["params"]

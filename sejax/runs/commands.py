@@ -58,8 +58,8 @@ def start(
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:
-    """Hears SIGTERM as Ctrl-C is heard, with the exit code that shells give it."""
-    # Where a callback of a library forgets the exception, it is raised again.
+    """Treats SIGTERM as Ctrl-C, with the exit code that shells give SIGTERM."""
+    # A library's callback may swallow the exception; then a second signal raises it again.
     again = threading.Timer(2.0, os.kill, (os.getpid(), number))
     again.daemon = True
     again.start()

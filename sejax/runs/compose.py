@@ -2,14 +2,15 @@
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
 texts; `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
-every group (that of a word, else what the task and the proxy suggest), and lays the layers on each
-other: the choices, the preset or what a stored proxy was learned with, and the words. Whether their
-names are fields of the choices shows when dataclasses are made of them.
+every group (a word's, else the default of the task and the proxy), and lays three layers on each
+other: the choices, the preset or what a stored proxy was learned with, and the words. Names are
+checked later, when `runs.config` makes dataclasses of the layers.
 
-sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset: values,
-`with_agent`, `with_es` and `with_objective` for those that only hold with one of these, and `like`
-for a section that it builds on, of its file or of `bases.yaml`. `general-<proxy>.yaml` serves tasks
-without a file of their own, and sections that say `like: general`. A user's file holds overrides.
+sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has
+values; values that hold with one agent, strategy or objective alone (`with_agent`, `with_es`,
+`with_objective`); and the section that it builds on (`like`), of its file or of `bases.yaml`.
+`general-<proxy>.yaml` serves tasks without a file of their own, and sections that say
+`like: general`. A user's file holds overrides.
 """
 
 import contextlib
@@ -246,33 +247,42 @@ def _of_preset(
 # --- layers --------------------------------------------------------------------------------------
 
 
+def typed(overrides: Sequence[str]) -> frozenset[str]:
+    """What is typed, lists taken apart: each `module:attribute` in it may be imported."""
+    texts = (override.partition("=")[2].strip("[]") for override in overrides)
+    return frozenset(x.strip("[]'\" ") for text in texts for x in split(text))
+
+
 def compose(
-    overrides: Sequence[str], groups: Collection[str], learns: bool, stored: Mapping[str, Any]
-) -> tuple[Layers, frozenset[str]]:
+    values: Mapping[str, Any],
+    groups: Collection[str],
+    learns: bool,
+    stored: Mapping[str, Any],
+    imports: Collection[str],
+) -> Layers:
     """Composes a command's words over its preset and its choices.
 
     Args:
-      overrides: as typed after the command.
+      values: by the names of words; see `read`.
       groups: of plugins whose choices are the command's fields.
       learns: whether presets have settings.
       stored: what a stored proxy was learned with, nested plain values.
+      imports: each `module:attribute` that may be imported.
 
     Returns:
       The layers in the order in which one lies on another, nested plain values by where they come
-      from, and what is typed: each `module:attribute` in it may be imported.
+      from.
 
     Raises:
       ConfigError: for words that cannot be, and for a choice or a preset that is not there.
     """
-    values, texts = read(overrides), words(overrides).values()
-    typed = frozenset(x.strip("[]'\" ") for text in texts for x in split(text.strip("[]")))
     names = agents_of(values) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = agents.DEFAULTS[0]
         task = {name[4:]: x for name, x in values.items() if name.startswith("env.")}
         task["name"] = values.get("env", DEFAULTS["env"])
         with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
-            default = agents.default_for(envs.spec_of(registry.configure("env", task, typed)))
+            default = agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
         names = {default: default}
     chosen: dict[str, Any] = {group: values.get(group, DEFAULTS[group]) for group in groups}
     layers: Layers = {
@@ -280,10 +290,10 @@ def compose(
         | {"agents": {key: {"name": name} for key, name in names.items()}}
     }
     if learns:
-        objective = registry.find("proxy", str(chosen["proxy"]), typed).default_objective
+        objective = registry.find("proxy", str(chosen["proxy"]), imports).default_objective
         of_preset = _of_preset(values, chosen, names, objective)
         layers[f"preset={of_preset['preset']}"] = of_preset
-    return layers | {"proxy": stored, "typed": _nested(values, names, groups)}, typed
+    return layers | {"proxy": stored, "typed": _nested(values, names, groups)}
 
 
 def _nested(

@@ -260,7 +260,7 @@ class EvaluateConfig(CommandConfig):
       baseline: as many agents trained on the real task, beside them
       out_dir: null: beside the proxy (runs/evaluate-<name> without a folder)
       real_training: On the real task, and how all agents are tested unless training_from=config.
-        Agents as_learned take its time limit as they did, or on an SE would have.
+        Agents as_learned keep the time_limit_is_terminal of the run.
     """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration",)
@@ -378,8 +378,9 @@ def evaluate_config(overrides: Sequence[str] = (), schema: Any = EvaluateConfig)
 
 def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, compose.Layers]:
     """A command's configuration of its words, and the layers that it comes from."""
-    stored = {} if schema.learns else _learned(compose.read(overrides))
-    layers, imports = compose.compose(overrides, schema.groups, schema.learns, stored)
+    values, imports = compose.read(overrides), compose.typed(overrides)
+    stored = {} if schema.learns else _learned(values)
+    layers = compose.compose(values, schema.groups, schema.learns, stored, imports)
     return _from_plain(schema, merge(*layers.values()), imports), layers
 
 
@@ -429,12 +430,11 @@ def words_of(config: CommandConfig) -> dict[str, Any]:
 
 
 def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a proxy was learned with, as far as the agents of an evaluation have it.
+    """What the agents of an evaluation take from the run that learned the proxy.
 
-    Where its words name no agent, they are all of the proxy's, with their exploration, and take the
-    time limit of the real task as the run says (of an SE, where it is idle, too); of a file
-    that does not tell its agents, the default one of its task. An agent that they name has the
-    hyperparameters that the proxy was learned with, if it was with such a one.
+    Words without an agent stand for all of the proxy's agents, with their exploration and with the
+    run's `time_limit_is_terminal`. An agent that a word names has the proxy's hyperparameters, if
+    the proxy was learned with that agent. A file without agents gets the task's default one.
 
     Raises:
       ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not

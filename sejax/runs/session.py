@@ -41,11 +41,11 @@ def run(
       config: the configuration.
       directory: its folder.
       chunks: the generations of this configuration.
-      report: hears how it goes on; None: nobody does.
+      report: is told of each generation; None: nobody is told.
 
     Returns:
-      What `run.json` holds. `ended` is finished, solved, or diverged: a run of whose agents none
-      has ended with finite numbers stops, and has no proxy.
+      What `run.json` holds. `ended` is finished, solved, or diverged: a run stops, without a proxy,
+      when all of its agents have diverged.
 
     Raises:
       ConfigError: if the folder's state is that of another version.

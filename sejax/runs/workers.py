@@ -36,10 +36,10 @@ from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
 Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
-BATCH = 16  # trainings in a share whose size nothing says
+BATCH = 16  # trainings in a share, where neither the agent nor the user says how many
 Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
 RETRIES = 20  # by Ray, of a share whose worker dies
-LOOK_S = 1.0  # between looks whether the cluster is there
+LOOK_S = 1.0  # seconds between checks that the cluster still answers
 
 
 class Chunks:

@@ -28,9 +28,6 @@ from sejax.options import ConfigError, Finite, NonNegative
 if TYPE_CHECKING:  # it imports mujoco
     from sejax.envs.mujoco.physics import Report
 
-# Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
-# MuJoCo, at ten times its cost on a CPU (docs/mujoco.md).
-
 # The entries of `info` that describe the state alone; an observation has no position along x or y.
 _STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
 _ON_A_LINE = ("x_position", "x_velocity")
