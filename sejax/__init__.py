@@ -2,8 +2,8 @@
 
 Learn a small network that stands in for a task (`make_learner`), load one that was learned
 (`load`), and train agents on it (`make_trainer`; `make_evaluator` tests them on the real task too).
-Everything takes objects: tasks (`Task`, `sejax.envs.make`), agents (`make_agent`), proxies,
-objectives and strategies of your own serve as well as those that come with sejax.
+All functions take objects. Your own tasks (`Task`, `sejax.envs.make`), agents (`make_agent`),
+proxies, objectives and strategies work like those of sejax.
 
 Names are imported on first use, as `__init__.pyi` lists them: importing `sejax` costs nothing, sets
 no environment variable and touches no flag.

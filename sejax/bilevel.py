@@ -42,24 +42,24 @@ class LearnState:
     key: Array
     es_state: StrategyState
     generation: Array
-    incumbent: Float[Array, " dims"]  # as the last generation measured it, before its update
+    incumbent: Float[Array, " dims"]  # measured by the last generation, before its update
     incumbent_score: Array
     incumbent_scores: Float[Array, " agent"]  # one for each agent of a mixture
     best: Float[Array, " dims"]
     best_score: Array
     best_scores: Float[Array, " agent"]
     best_generation: Array
-    solved: Array  # with stop_when_solved: the run is over and its generations cost nothing
+    solved: Array  # with stop_when_solved: the run is over; later generations cost nothing
 
 
 @struct.dataclass
 class LearnResult:
     """Result of a whole run."""
 
-    weights: PyTree  # the best proxy's, as from its `init_weights`
-    score: Array  # its incumbent mean
-    generation: Array  # that measured it, int32
-    last_weights: PyTree  # of the last proxy that was measured
+    weights: PyTree  # of the best proxy, in the form of its `init_weights`
+    score: Array  # incumbent mean of the best proxy
+    generation: Array  # int32, the generation that measured the best proxy
+    last_weights: PyTree  # of the last measured proxy
     info: GenerationInfo  # history, leaves [generation, ...]
 
 
@@ -69,19 +69,19 @@ class Bilevel:
 
     proxy: ProxyEnv
     strategy: Strategy
-    scoring: Scoring  # by which agents and which objective
+    scoring: Scoring  # the agents and the objective
     evaluate: GenerationEvaluator
     unravel: Callable[[Array], PyTree]  # a flat vector [dims] to the proxy's weights
     stop_when_solved: bool
 
     @property
     def solved_score(self) -> float | None:
-        """Incumbent mean at which the task counts as solved; None if no score says so."""
+        """Incumbent mean at which the task counts as solved; None if scores cannot tell."""
         task, objective = self.proxy.task, self.scoring.objective
         return task.solved_reward if objective.scores_are_returns and task.is_solvable else None
 
     def is_solved(self, score: Array) -> Array | bool:
-        """Whether a run ends at an incumbent mean."""
+        """Whether this incumbent mean ends the run."""
         return self.stop_when_solved and score >= self.proxy.task.solved_reward
 
     def init(self, key: Array) -> LearnState:
@@ -130,10 +130,11 @@ class Bilevel:
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
-        Of equally good incumbents the last one is kept. Once incumbents reach the task's highest
-        return, the search still moves to weights that teach under perturbation too.
+        Of equally good incumbents it keeps the last. Reason: once incumbents reach the task's
+        highest return, the search still moves to weights that also teach when perturbed.
         """
-        # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
+        # XLA must not fuse the sums below into the program of the outcome: they would round
+        # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
         compared = self.scoring.for_strategy(outcome)
         es_state = self.strategy.tell(
@@ -165,16 +166,16 @@ def make_learner(
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
-    Jitted it is one executable with the scan inside. `vmap` it over keys for several runs at once.
+    `jax.jit` makes it one executable with the scan inside; `vmap` over keys makes several runs.
 
     Args:
-      config: from `sejax.config`, in the place of all others. Its `seed`, `run_dir` and
-        `checkpoint_every` are the command's and play no part here.
+      config: from `sejax.config`; replaces all other arguments. Its `seed`, `run_dir` and
+        `checkpoint_every` are for the command and have no effect here.
       generations: n_o of Algorithm 1.
-      **parts: of `make_bilevel`: `task` and `agent`, and what differs from the defaults.
+      **parts: arguments of `make_bilevel`: `task`, `agent`, and any others.
 
     Raises:
-      ConfigError: if the parts do not fit each other, or there are not so many devices.
+      ConfigError: if the parts do not fit each other, or there are too few devices.
       TypeError: if neither a configuration nor a task and an agent are given.
 
     Example:
@@ -221,24 +222,24 @@ def make_bilevel(
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Bilevel:
-    """Builds Algorithm 1 of its parts, each an object or a configuration that makes it.
+    """Builds Algorithm 1 from its parts; each is an object or a configuration that makes one.
 
     Args:
       task: the real task.
       agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
-        mixture of agents (`sejax.Mixture`), among which the candidates are divided.
+        mixture of agents (`sejax.Mixture`), which share the candidates.
       proxy, es, objective: by default a one-step SE, NES, and the mean test return.
       training: how long each agent trains, and how it is tested.
       stop_when_solved: whether a run ends at its first incumbent mean that solves the task.
       devices: devices to spread the candidates over; None for all.
-      num_parallel: agents that train in one vmapped batch on a device; None for what suits both.
+      num_parallel: agents in one vmapped batch on a device; None: chosen by agent and device.
 
     Raises:
-      ConfigError: if the parts do not fit each other, or there are not so many devices.
+      ConfigError: if the parts do not fit each other, or there are too few devices.
     """
     require_part("task", Task, task)
     proxy = make("proxy", proxy, task)
-    must = f"must be one of the task given; got one of {proxy.task.name}. Set task to the proxy's."
+    must = f"must be of the given task; got one of {proxy.task.name}. Set task to the proxy's."
     require(proxy.task is task, "proxy", must)
     objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
@@ -255,6 +256,6 @@ def make_bilevel(
         stop_when_solved=stop_when_solved,
     )
     can_stop = not stop_when_solved or bilevel.solved_score is not None
-    must = "must be false where no score of this objective, task and mixture says solved; got true."
+    must = "must be false, as scores of this objective and task cannot say solved; got true."
     require(can_stop, "stop_when_solved", must)
     return bilevel

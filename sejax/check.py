@@ -1,14 +1,14 @@
-"""Is a learned environment more than a policy? Four comparisons, and a verdict.
+"""Is a learned environment more than a policy? Four comparisons and a verdict.
 
   python -m sejax.check proxy=RUN_DIR
   python -m sejax.check proxy=cartpole num_agents=40 algorithms=[sac]
 
-- Myopia: the agents that it was learned with, with lower discounts (not in episodes of one step,
-  where a discount has no effect).
-- Algorithms: agents that it was not learned with.
-- Null baseline: of an SE, a policy that costs little, written down as a one-step SE for the same
-  agents; of a reward network (RN), the same agents without it, and tuned ones.
-- Cost: agents until it has repaid the real steps of learning it.
+- Myopia: the agents that it was learned with, at lower discounts. Left out if episodes have one
+  step, where a discount has no effect.
+- Algorithms: other agents than those that it was learned with.
+- Null baseline: for an SE, the same agents on a one-step SE made of a cheap policy; for a reward
+  network (RN), the same agents without it, and tuned agents.
+- Cost: how many agents must train on it to save the real steps that learning it took.
 
 Writes check.json and check.png into out_dir. The same command resumes where it stopped.
 """
@@ -47,11 +47,11 @@ from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
 DISCOUNTS = (0.0, 0.5, 0.9)  # beside the agents' own
-FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, what is often fastest on the task
-# Mania et al. (2018) search the hyperparameters for each task; here they are the same for all.
+FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, the agent that often learns fastest
+# Mania et al. (2018) search the hyperparameters for each task; here all tasks share them.
 ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
 ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
-FREE = {"devices", "machines", "out_dir", "num_agents"}  # when the command is repeated
+FREE = {"devices", "machines", "out_dir", "num_agents"}  # may change when a command is repeated
 # Rows of the table.
 MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
@@ -65,10 +65,10 @@ class CheckConfig(EvaluateConfig):
 
     Attributes:
       machines: where agents train
-      algorithms: Agents that it was not learned with, with default hyperparameters; null: all that
-        fit the task.
-      null_steps: real steps of finding a policy, at most, by a random search and, if that does not
-        solve the task, by a PPO
+      algorithms: Other agents than those it was learned with, with default hyperparameters; null:
+        all that fit the task.
+      null_steps: most real steps of a random search for a policy, and of a PPO that follows if the
+        search does not solve the task
     """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration", "machines")
@@ -88,7 +88,7 @@ def main(overrides: Sequence[str]) -> None:
     """Checks a proxy as the overrides say.
 
     Raises:
-      ConfigError: for overrides that cannot be, or a proxy that cannot be judged.
+      ConfigError: for invalid overrides, or a proxy that cannot be judged.
       OSError: if a file cannot be written.
     """
     runtime.configure_jax()
@@ -101,7 +101,7 @@ def help_text(overrides: Sequence[str]) -> str:
 
 
 def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
-    """Tells whether a learned environment is more than a policy, as `python -m sejax.check`.
+    """Tells whether a learned environment is more than a policy, like `python -m sejax.check`.
 
     Args:
       proxy: a run directory, a file, or a shipped name.
@@ -111,17 +111,17 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
       What `check.json` holds: `verdict`, `judgements` by agent, `null_se`, `cost` and `worlds`.
 
     Raises:
-      ConfigError: for a field that cannot be, or a proxy that cannot be judged.
+      ConfigError: for an invalid field, or a proxy that cannot be judged.
     """
     words = [f"{name}={as_text(value)}" for name, value in {"proxy": proxy, **fields}.items()]
     return run(configuration.evaluate_config(words, CheckConfig))
 
 
 def run(config: CheckConfig) -> dict[str, Any]:
-    """Trains the agents that are missing, and says what was found; see `check`."""
+    """Trains the agents whose results are missing, and reports the findings; see `check`."""
     proxy, learned = loaded(config), dict[str, Any](config.agents)
     task = proxy.task
-    jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # or it says why it cannot
+    jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
     require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
@@ -159,7 +159,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
 
 
 def _tuned(task: Task) -> AgentConfig:
-    """An agent with the settings of `preset=best`, but for random episodes that help on SEs."""
+    """An agent with the settings of `preset=best`, but one warm-up episode: more help on SEs."""
     name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
     beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
     fields = beside.get("agent", {}) | {"name": name, "warmup_episodes": 1}
@@ -169,9 +169,10 @@ def _tuned(task: Task) -> AgentConfig:
 def _null(
     config: CheckConfig, task: Task, on_proxy: World, store: Store
 ) -> tuple[World, dict[str, Any]]:
-    """A policy that costs little as a one-step SE, on which agents train as long as on the proxy.
+    """A one-step SE made of a cheap policy; agents train on it as long as on the proxy.
 
-    A random search finds it or, if that does not solve the task, maybe a PPO.
+    A random search finds the policy. If it does not solve the task, a PPO is trained too, and the
+    better policy is taken.
     """
     uses = ("search", "test", "record")
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), 3), strict=True))
@@ -192,7 +193,7 @@ def _null(
 
 
 def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
-    """A line for each agent; what is missing is computed, a row at a time, and kept."""
+    """A line for each agent. Missing results are computed, a row at a time, and stored."""
     tables = []
     with config.machines.pool() as pool:
         for row, (world, keys) in rows.items():
@@ -212,7 +213,7 @@ def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
 def _told(
     proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
 ) -> dict[str, Any]:
-    """Prints and writes what agents tell: of an SE by returns, of an RN by training steps."""
+    """Prints and writes the findings. Agents score returns on an SE, training steps on an RN."""
     task, is_rn, is_lost = proxy.task, proxy.env.is_real, table["nonfinite"] > 0
     table["test_return"] = counted(table["test_return"].mask(is_lost))
     table["train_steps"] = table["train_steps"].mask(is_lost, table["train_steps"].max())
@@ -230,11 +231,11 @@ def _told(
     summary = summarise(table, ["world"])
     steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
     learning = zoo.describe(header.read(proxy.path)).learning
-    run: dict[str, Any] = vars(learning) if learning else {}  # of the file, or beside it
+    run: dict[str, Any] = vars(learning) if learning else {}  # from the file, else run.json
     with contextlib.suppress(OSError, ValueError):
         run = run or json.loads(proxy.path.with_name("run.json").read_text())
     cost: dict[str, Any] = {name: run[name] for name in ("real_steps", "cpu_s") if name in run}
-    if cost:  # never, where its agents do not reach the solved score
+    if cost:  # "never" if agents trained on the proxy do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())

@@ -1,15 +1,15 @@
-"""Make an SE of a policy, and choose it by what it teaches.
+"""Make an SE of a policy; of several candidates, keep the SE that teaches best.
 
   python -m sejax.distill env=pendulum policy=ppo:model.zip    a model of Stable-Baselines3
   python -m sejax.distill env=cartpole policy=my_module:act    a function of observations
   python -m sejax.distill env=cartpole policy=ppo              an agent of sejax, which is trained
   python -m sejax.distill env=halfcheetah agents=[td3,sac,ppo] search.generations=200
 
-A copy of the policy, a small network, becomes the reward of a one-step SE. Without `policy` linear
-ones are found by augmented random search: the best of each part of the search becomes an SE,
-students train on each, and the SE that teaches best is kept. Other fields are those of sejax.run
-with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv into run_dir;
-the same command resumes where it stopped.
+A small network copies the policy and becomes the reward of a one-step SE. Without `policy`,
+augmented random search finds linear policies. The best policy of each part of the search becomes
+an SE, students train on each SE, and the SE that teaches best is kept. All other fields are those
+of sejax.run with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv
+into run_dir. The same command resumes where it stopped.
 """
 
 import dataclasses
@@ -40,10 +40,10 @@ from sejax.runs.store import Store
 # Fields of sejax.run that have an effect here.
 TAKEN = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices",
          "run_dir"}  # fmt: skip
-# Students where none are named, and how long they train.
+# The default students and how many steps they train, by kind of actions.
 STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
 STEPS = {"continuous": "10000", "discrete": "2000"}
-CHECKPOINT = "checkpoint"  # the entry that a run's folder has too
+CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
 CHOOSE, TEST = "choose", "test"  # what students are for
 
 
@@ -54,14 +54,14 @@ class DistillConfig(Options):
     Attributes:
       policy: ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax,
         such as ppo. null: a linear policy is searched.
-      copy: of a given policy
-      search: of a linear policy
+      copy: how a given policy is copied
+      search: how a linear policy is searched
       independent_starts: Whether the numbers of an initial state are independent; else they have
         the visited states' covariance.
-      num_snapshots: Policies that are taught: the best tested one of each of so many equal parts of
-        the search, at most as many as it tests.
-      num_students: Students of each agent on the SE of each policy, which choose one of the SEs.
-      num_tested: Others of each agent, on the chosen SE.
+      num_snapshots: Policies that become SEs: the search is cut into this many equal parts (at
+        most one for each test), and each part gives its best tested policy.
+      num_students: Students of each agent on each SE; their returns choose one of the SEs.
+      num_tested: Further students of each agent, on the chosen SE.
     """
 
     group: ClassVar[str] = ""
@@ -79,7 +79,7 @@ def main(overrides: Sequence[str]) -> None:
     """Distils as the overrides say.
 
     Raises:
-      ConfigError: for overrides that cannot be, or a folder of another command.
+      ConfigError: for invalid overrides, or a folder of another command.
       OSError: if a file cannot be written.
     """
     job, config = read(overrides)
@@ -102,7 +102,7 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     """The command's fields, and a configuration of task, students and trainings.
 
     Raises:
-      ConfigError: for overrides that cannot be.
+      ConfigError: for invalid overrides.
     """
     values: dict[str, Any] = {}
     others = {}
@@ -118,7 +118,7 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
     actions = envs.spec_of(task.env).actions
     steps = others.get("training.max_steps", STEPS[actions]).rpartition("=")[2]
-    # An episode of a one-step SE is a step.
+    # An episode of a one-step SE has one step.
     defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
     if not others.keys() & {"agent", "agents"}:
         defaults["agents"] = STUDENTS[actions]
@@ -140,29 +140,29 @@ def folder_of(job: DistillConfig, config: LearnConfig) -> Path:
 
 
 def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
-    """Finds policies, teaches them, and writes the SE that teaches best.
+    """Finds policies, makes SEs of them, and writes the SE that teaches best.
 
     Args:
       job: how policies are found, and how many students there are.
       config: task, students and their trainings, and seed.
-      folder: where files are written; what was finished there is not done again.
+      folder: where files are written; finished parts found there are not repeated.
       words: the command's overrides, for the card.
 
     Returns:
       The SE's file.
 
     Raises:
-      ConfigError: for a folder of another command, or a policy that cannot be.
+      ConfigError: for a folder of another command, or an invalid policy.
       OSError: if a file cannot be written.
     """
     with Store(folder, settings_of(job, config)) as store:
-        store.get(CHECKPOINT)  # which refuses a folder of another command
+        store.get(CHECKPOINT)  # raises for a folder of another command
         return _distilled(job, config, store, words)
 
 
 def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
     task, folder = config.task(), store.folder
-    # Policies are tested by the last key, too. "nothing" keeps the numbers of stored proxies.
+    # The last key also tests policies. The unused key "nothing" keeps the numbers of old runs.
     uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if job.policy is None:
@@ -204,13 +204,13 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
 
 
 def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
-    """What the numbers depend on, as plain values."""
+    """The settings that the results depend on, as plain values."""
     plain = config.plain()
     return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """What fresh students of each agent reach, as the SE's file keeps it."""
+    """The results of fresh students of each agent, in the form that the SE's file keeps."""
     return [
         {
             "agent": agent,

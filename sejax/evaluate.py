@@ -1,6 +1,6 @@
-"""Train fresh agents on a stored proxy, and on the real task beside them; test all there.
+"""Train fresh agents on a stored proxy, and others on the real task; test all on the real task.
 
-Without agent=NAME they are those that the proxy was learned with.
+By default they are the agents that the proxy was learned with; agent=NAME takes another one.
 
   python -m sejax.evaluate proxy=RUN_DIR num_agents=20
   python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
@@ -43,7 +43,7 @@ SHOWN = {
 
 
 class World(NamedTuple):
-    """Where agents train, the real task on which they are tested, and how long, by their keys."""
+    """Where agents train, the real task that tests them, and their training limits by key."""
 
     env: Any
     params: Any
@@ -55,7 +55,7 @@ def main(overrides: Sequence[str]) -> None:
     """Evaluates each configuration that the overrides describe.
 
     Raises:
-      ConfigError: for overrides that cannot be, or a proxy that cannot be loaded.
+      ConfigError: for invalid overrides, or a proxy that cannot be loaded.
       OSError: if a file cannot be written.
     """
     configs = configs_of(overrides)
@@ -97,7 +97,7 @@ def evaluate(config: EvaluateConfig) -> float:
     print_table(summary, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     text = str(summary.to_json(orient="index", indent=2))
-    if others:  # in each world an object for each of them
+    if others:  # an object for each world, and in it one for each agent
         of_worlds = {world: summary.loc[world].to_json(orient="index") for world in worlds}
         text = json.dumps({world: json.loads(x) for world, x in of_worlds.items()}, indent=2)
     write_text(out_dir / "evaluation.json", text)
@@ -105,10 +105,10 @@ def evaluate(config: EvaluateConfig) -> float:
 
 
 def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
-    """Where the agents of an evaluation train: on the proxy, and on its real task beside it.
+    """Where the agents of an evaluation train: on the proxy, and others on its real task.
 
     Returns:
-      The worlds by name, the first one first in tables; and the folder of the files.
+      The worlds by name, in the order of tables; and the folder for the files.
 
     Raises:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or agents that
@@ -127,7 +127,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
         group, training = "real_training", real_training
         if config.training_from == "config":
             group, training = "training", config.training
-        elif proxy is not None and not proxy.env.is_real:  # else as on the real task
+        elif proxy is not None and not proxy.env.is_real:  # RNs train as on the real task
             training = _as_learned(proxy, config, agent)
         if proxy is not None:
             config.require_learning(key, group, training, proxy.env.config, task)
@@ -146,7 +146,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
 
 
 def loaded(config: EvaluateConfig) -> Proxy:
-    """The proxy; modules are imported if the command line names them, never because a file does.
+    """Loads the proxy. Imports modules that the command line names, never those that a file names.
 
     Raises:
       ConfigError: if it cannot be loaded, or `env` is not its task.
@@ -168,7 +168,7 @@ def loaded(config: EvaluateConfig) -> Proxy:
 
 
 def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
-    """How long agents train on an SE, which its file says."""
+    """How long agents train on an SE, by the SE's file."""
     message = "must be config for an SE whose file does not say how long agents train. Set "
     fix = "training_from=config training.max_steps=2000 training.max_episodes=2000."
     require("training" in proxy.config, "training_from", message + fix)
@@ -190,14 +190,14 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
 
 
 def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
-    """What fresh agents reach in a world, arrays `[agent]` by the table's columns."""
+    """The results of fresh agents in a world: arrays `[agent]` by column of the table."""
     env, env_params, task, trainings = world
     is_varied = config.agent_hparams == "varied"
     agent = agents.make_agent(config.agents[key], task, config.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     how = trainings[key], keys, config.num_parallel, config.devices
     outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))
-    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
+    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # one for each agent
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     return {"test_return": outcome.test_return, **of_agents, **varied}
 
@@ -205,7 +205,7 @@ def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
 def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Mean and standard deviation of each column for each group.
 
-    An agent that diverged counts as the worst of all.
+    An agent that diverged counts with the worst return of all agents.
     """
     returns = table["test_return"].mask(table["nonfinite"] > 0)
     table = table.assign(test_return=returns.fillna(returns.min()))

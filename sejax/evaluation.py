@@ -48,7 +48,7 @@ class Tests(NamedTuple):
     Attributes:
       returns: return of each episode within the task's step limit.
       num_steps: steps of each.
-      scored: sum of `info["scored_reward"]`, of the reward where a step does not have it.
+      scored: sum of `info["scored_reward"]`, or of the reward in steps without that entry.
     """
 
     returns: Float[Array, " episode"]
@@ -71,10 +71,10 @@ class _Episode:
 def _greedy(
     agent: Agent, env: Environment
 ) -> tuple[Callable[..., _Episode], Callable[..., tuple[_Episode, Steps]]]:
-    """Builds the beginning of a greedy episode, `(key, active, params) -> episode`, and a step.
+    """Builds two functions: one begins a greedy episode, the other makes a step of it.
 
-    The step is `(key, agent_state, before, params) -> (after, decision)`, with the key of the whole
-    episode.
+    They are `(key, active, params) -> episode` and `(key, agent_state, before, params) -> (after,
+    decision)`. The step takes the key of the whole episode.
     """
 
     def begin(key: Array, active: Array | bool, params: PyTree) -> _Episode:
@@ -112,15 +112,15 @@ def make_tester(
 ) -> Callable[..., Tests]:
     """Builds `test(key, agent_state, active=True, params=None) -> Tests`.
 
-    Episodes on the real task without exploration, each from a fresh initial state. With
-    `active=False` nothing is played and all results are 0.
+    It plays episodes on the real task without exploration, each from a fresh initial state. With
+    `active=False` it plays nothing and all results are 0.
 
     Args:
-      agent: whose actions are played.
-      task: the real task, whose params are the default ones.
-      num_episodes: of each test.
-      test_env: what the episodes are played in, given the task's environment with the agent's
-        action repeat; by default that itself.
+      agent: chooses the actions.
+      task: the real task; gives `params` by default.
+      num_episodes: episodes of each test.
+      test_env: maps the task's environment, with the agent's action repeat, to the environment of
+        the episodes; by default the same one.
     """
     env = repeat_actions(task.env, agent.spec.action_repeat)
     begin, decide = _greedy(agent, test_env(env))
@@ -153,8 +153,8 @@ def make_recorder(
 ) -> Callable[[Array, AgentState], Steps]:
     """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
 
-    The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
-    one step here.
+    The episodes are those of `make_tester` with the same key. A decision is one step here, even if
+    the agent repeats its action.
     """
     begin, decide = _greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
 
@@ -190,20 +190,20 @@ def make_evaluator(
     """Builds `evaluate(key, env_params, active=True, test_params=None) -> Outcome`.
 
     A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
-    `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
-    agent's hyperparameters are drawn, they are drawn from the same key first. `test_params` are the
-    params of the test episodes; default: the task's.
+    `training.test_episodes` episodes on the task. With `active=False` nothing is computed. Varied
+    hyperparameters of the agent are drawn first, from the same key. `test_params` are the params of
+    the test episodes; default: the task's.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
-      test_env: as of `make_tester`, for the test after the training.
-      in_batches: as of `make_trainer`.
+      test_env: as in `make_tester`, for the test after the training.
+      in_batches: as in `make_trainer`.
 
     Raises:
-      ConfigError: for arguments of other kinds, or test episodes that may be far longer than the
+      ConfigError: for arguments of the wrong kind, or if a test episode may be far longer than the
         training.
 
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
@@ -263,14 +263,14 @@ def make_evaluator(
 def make_tested_trainer(
     agent: Agent, env: Environment, task: Task, training: TrainingConfig, **options: Any
 ) -> Callable[..., TrainResult]:
-    """A `make_trainer` whose tests between episodes, if `training` asks for any, are on the task.
+    """As `make_trainer`; tests between episodes, if `training` asks for any, are on the task.
 
     Args:
       agent: from `sejax.make_agent`.
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
-      **options: of `make_trainer`.
+      **options: further arguments of `make_trainer`.
 
     Source: paper, section "Experiments with Reward Networks" (training and testing alternate).
     """
@@ -284,9 +284,9 @@ def make_tested_trainer(
 
 
 def tested_throughout(training: TrainingConfig) -> TrainingConfig:
-    """The same training with tests between its episodes, which goes on when the task is solved.
+    """The same training with tests between its episodes, and no stop when the task is solved.
 
-    The area under a learning curve that ended there would reward learning late.
+    If the learning curve ended there, the area under it would reward late learning.
     """
     stop_rule = "never" if training.stop_rule == "solved" else training.stop_rule
     tests_between = max(1, training.num_tests_between)
@@ -297,8 +297,9 @@ def area_under_curve(result: TrainResult, final_return: Array) -> Array:
     """Sum over training episodes of return times length: the area under the learning curve.
 
     Args:
-      result: of a training. The returns are those of its tests, where it had any.
-      final_return: of the test after it, for the steps of an episode that the step limit cut off.
+      result: result of a training. If it has test returns, they replace the training returns.
+      final_return: return of the test after the training; counts for the steps of an episode that
+        the step limit cut off.
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
     Objectives" (AUC); `docs/reference.md` 5.5.
@@ -325,10 +326,10 @@ def evaluate_agents(
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
-    `env, env_params` are what `sejax.load` returns, `task` the real one. It compiles once for equal
-    arguments; `env_params` may differ, and `keys` in their values. The numbers are those of
-    `jax.vmap(make_evaluator(...))` up to rounding: a program of another width adds in another
-    order, and in a training a last bit grows.
+    `sejax.load` returns `env, env_params`; `task` is the real task. Calls with equal arguments
+    share a compiled program; `env_params` and values of `keys` may differ. Results equal those of
+    `jax.vmap(make_evaluator(...))` up to rounding: programs of another width add in another order,
+    and a training amplifies a difference in the last bit.
     """
     env = env.bare if isinstance(env, ProxyEnv) else env
     program = _evaluation_program(agent, env, task, training, num_parallel, devices)

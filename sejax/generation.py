@@ -47,25 +47,25 @@ class Trainings:
 class GenerationEvaluator:
     """`evaluate(candidates) -> Outcome`: all trainings of a generation, and their tests.
 
-    Leaves are `[training, ...]`, those of a candidate in a row, and the incumbent's last.
+    Leaves are `[training, ...]`: candidate by candidate, and then the incumbent's trainings.
 
-    One program holds both groups: each agent's trainings, on candidates and on the incumbent, are
-    spread over the devices, and on each of them batches of `num_parallel` follow one another. No
-    training executes another agent's branch.
+    One program holds both groups. It spreads each agent's trainings, on candidates and on the
+    incumbent, over the devices. Each device runs batches of `num_parallel` trainings one after the
+    other. No training executes another agent's branch.
 
     Args:
-      proxy: whose weights a candidate is.
-      unravel: a candidate to the weights.
+      proxy: the proxy; a candidate is a vector of its weights.
+      unravel: turns a candidate into weights.
       training: how long each agent trains, and how it is tested.
-      scoring: who trains on which candidate, how often, and what test episodes are played in.
+      scoring: which agent trains on which candidate, how often, and the world of test episodes.
       devices: None for all.
-      num_parallel: None for what suits each agent.
+      num_parallel: None: chosen for each agent.
 
     Attributes:
       devices: as given.
-      runs: of each agent, `(training) -> Outcome` for one of its `Trainings`.
-      widths: of each agent, trainings in a vmapped batch on a CPU core; None for all.
-      sizes: of each agent, trainings in a generation.
+      runs: for each agent, `(training) -> Outcome`, for one of its `Trainings`.
+      widths: for each agent, the trainings in a vmapped batch on a CPU core; None for all.
+      sizes: for each agent, the number of trainings in a generation.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
@@ -127,7 +127,7 @@ class GenerationEvaluator:
     def joined(self, by_agent: Sequence[Outcome]) -> Outcome:
         """The outcomes of all `trainings`: by candidate, and then by turn of the incumbent.
 
-        A single agent's stay as they are: XLA would round sums over a copy otherwise.
+        A single agent's outcomes are not copied: XLA would round sums over a copy differently.
         """
         if len(by_agent) == 1:
             return by_agent[0]

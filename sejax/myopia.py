@@ -1,12 +1,12 @@
 """The myopia test: does what is learned teach by its rewards alone, or by its dynamics?
 
-An agent with a discount of 0 sees the reward of its next step alone. What teaches it as much as a
-far-sighted agent is a policy in disguise, however long its episodes are.
+An agent with a discount of 0 sees only the reward of its next step. A proxy that teaches it as much
+as a far-sighted agent is a policy in disguise, however long its episodes are.
 
-Scores are test returns, from those of untrained agents (the floor) to the task's solved return. Of
-a reward network, on which all agents learn sooner or later, they are training steps with a minus
-sign, from those of agents without it to none. A difference below `MARGIN` of the way counts as
-none; more and less are those of Student's interval over agents, in pairs of equal seeds.
+Scores are test returns, from the return of untrained agents (the floor) to the task's solved
+return. With a reward network all agents learn sooner or later. There scores are minus the training
+steps, from the score of agents without the network to 0. A difference below `MARGIN` of this range
+counts as none. Student's interval over agents, paired by seed, decides what is above and below.
 """
 
 import math
@@ -20,13 +20,13 @@ from scipy.special import stdtrit
 MARGIN = 0.1
 LEVEL = 0.95
 LEAST = 5  # independent values that an interval needs
-NONE = (math.nan, math.nan)  # of fewer
+NONE = (math.nan, math.nan)  # the interval of fewer values
 
 
 def mean_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float]:
     """Student's confidence interval of the mean of independent values `[n]`; `NONE` if n < `LEAST`.
 
-    Average what belongs together before, such as the agents that one proxy trained.
+    First average values that depend on each other, such as the agents that one proxy trained.
     """
     values = np.asarray(values, float)
     if values.size < LEAST:
@@ -41,7 +41,7 @@ class Judgement(NamedTuple):
     Attributes:
       verdict: policy, dynamics, teaches little, or open.
       loss: mean score that a discount of 0 costs, and the ends `low` and `high` of its interval.
-      missing: agents that may decide beside these, where it is open.
+      missing: number of further agents that may decide an open verdict.
     """
 
     verdict: str
@@ -52,18 +52,18 @@ class Judgement(NamedTuple):
 
 
 def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Judgement:
-    """Judges by the scores of agents with a discount of 0 and with their own.
+    """Compares agents with a discount of 0 to far-sighted ones, with their own discount.
 
-    - dynamics: they differ by more than the margin;
-    - policy: by less, and the far-sighted score more than the margin above the floor;
-    - teaches little: they do not;
-    - open: the intervals hold both.
+    - dynamics: the far-sighted agents score better by more than the margin;
+    - policy: by less than the margin, and they score above the floor by more than the margin;
+    - teaches little: they score above the floor by less than the margin;
+    - open: an interval contains the margin.
 
     Args:
       myopic: scores of agents with a discount of 0, `[n]`.
-      far: of agents of the same seeds with their own discount, `[n]`.
-      floor: of agents that nothing was taught, `[n]` or a number.
-      top: score of agents that were taught all.
+      far: scores of agents with the same seeds and their own discount, `[n]`.
+      floor: scores of agents that learned nothing, `[n]` or a number.
+      top: score of agents that learned all.
 
     Example:
       >>> judge([98, 99, 97, 99, 98], [99, 98, 99, 99, 99], 20.0, 95.0).verdict
@@ -81,17 +81,17 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
         verdict = "teaches little" if gain_high < margin else "open"
     halves = np.array([high - low, gain_high - gain_low]) / 2
     distances = np.abs([lost.mean() - margin, gained.mean() - margin])
-    # The width of an interval falls with the root of the number of agents.
+    # The width of an interval falls with the square root of the number of agents.
     needed = len(far) * np.max((halves / np.maximum(distances, 1e-9)) ** 2)
     missing = math.ceil(min(needed, 1e6)) - len(far) if math.isfinite(needed) else LEAST - len(far)
     return Judgement(verdict, float(lost.mean()), low, high, max(1, missing))
 
 
 def verdict_of(judgements: Collection[Judgement]) -> str:
-    """The verdict on a proxy, in words, by those of all algorithms that it was learned with.
+    """The verdict on a proxy, in words, from a judgement for each algorithm it was learned with.
 
-    One algorithm that learns as much without looking ahead shows that the rewards hold a policy.
-    That the dynamics teach is said if all that learn must look ahead.
+    If one algorithm learns as much without looking ahead, the rewards hold a policy. The dynamics
+    teach if every algorithm that learns must look ahead.
     """
     verdicts = {judgement.verdict for judgement in judgements}
     if "policy" in verdicts:

@@ -22,18 +22,18 @@ from sejax.options import Count, NonNegative, Options, require
 
 @struct.dataclass
 class Outcome:
-    """What came of one agent. Leaves are `[]` but for the first, and `[agent, ...]` for many.
+    """The result of one agent. Leaves are `[]`, returns `[episode]`; `[agent, ...]` for many.
 
     Attributes:
       test_returns: return of each test episode on the real task, in reward units; a single nan
         where there was no test.
-      scored_returns: the same as `Objective.test_env` scores them.
+      scored_returns: returns of the same episodes, as `Objective.test_env` scores them.
       train_steps: steps in the training world.
-      train_episodes: episodes there.
-      auc: sum over those episodes of their return times their length; the returns are those
-        of the tests after each, where there are such tests. An episode that the step limit cut off
-        counts with the test return.
-      nonfinite: whether a number that is not finite was met in training; the score is then nan.
+      train_episodes: episodes in the training world.
+      auc: sum over training episodes of return times length. If there are tests between episodes,
+        the return is that of the tests after the episode. An episode that the step limit cut off
+        counts with the final test return.
+      nonfinite: whether training met a number that is not finite; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
     """
 
@@ -57,17 +57,16 @@ class Objective:
 
     Attributes:
       score: `outcome -> [agent]` float32, leaves of the outcome `[agent, ...]`. A training that
-        diverged is worth nothing, whatever this says of it.
-      needs_tests: whether it looks at tests between training episodes: then agents are tested after
-        each of them, and none stops because it has solved the task.
-      scores_are_returns: whether scores are mean returns, which the task's threshold can be held
-        against.
-      shown: the score that people see and that selects the best proxy, likewise; None where it is
-        `score`, which otherwise compares candidates within a generation alone.
-      test_env: what test episodes are played in, given the real task's environment; by default that
-        itself. The `info["scored_reward"]` of its steps adds up to `Outcome.scored_returns`.
+        diverged gets nan, whatever this function returns.
+      needs_tests: whether it uses tests between training episodes. Then agents are tested after
+        each episode, and solving the task ends no training.
+      scores_are_returns: whether scores are mean returns, comparable with the task's solved reward.
+      shown: the score that people see and that selects the best proxy, a function like `score`.
+        With None it is `score`; else `score` only compares candidates within a generation.
+      test_env: maps the real task's environment to that of test episodes; by default the same. The
+        `info["scored_reward"]` of its steps adds up to `Outcome.scored_returns`.
       test_params: `generation -> EnvParams` of `test_env`; None for the task's.
-      meaning: of a score, for people.
+      meaning: what a score means, for people.
     """
 
     score: Callable[[Outcome], Float[Array, "*agent"]]
@@ -101,15 +100,15 @@ class ObjectiveConfig(Options, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class MaxReward(ObjectiveConfig):
-    """The mean test return (SEs), of all of the test episodes or, at first, of other lengths.
+    """The mean test return (SEs); in early generations, optionally, over another number of steps.
 
-    Short ones (a Pendulum is rewarded for where it goes at once) or long ones (a car that reaches
-    the hill at all) tell proxies apart that a whole episode of the task's does not.
+    Other lengths can tell proxies apart that the task's own length does not. Short episodes show
+    where a Pendulum goes at once; long ones show whether a car reaches the hill at all.
 
     Attributes:
       first_eval_steps: Steps of a test episode that are scored in the first generation; null: the
         task's limit.
-      curriculum_generations: Generation from which on the task's limit counts; before, the steps
+      curriculum_generations: Generation from which the task's limit counts; until then the steps
         change linearly.
 
     Source: paper, Algorithm 1, EvaluateAgent; the curriculum: Liesen et al., "Discovering Minimal
@@ -176,7 +175,7 @@ class RewardThreshold(ObjectiveConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class AUC(ObjectiveConfig):
-    """The area under the curve of test returns over training steps, by the number of these (RNs).
+    """The area under the curve of test returns over training steps, divided by the steps (RNs).
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
     Objectives".
@@ -192,10 +191,10 @@ class AUC(ObjectiveConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class AUCSum(ObjectiveConfig):
-    """That area itself, as in the authors' code.
+    """The area under the same curve, not divided, as in the authors' code.
 
-    Agents train a number of episodes, so that it rewards short ones where returns are negative, and
-    long ones where they are positive.
+    Agents train for a number of episodes. So the area rewards short episodes if returns are
+    negative, and long episodes if returns are positive.
 
     Source: `docs/reference.md` 5.5.
     """

@@ -1,5 +1,5 @@
-"""Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
-real dynamics (proxy=rn), from agents trained on nothing else.
+"""Learn a small network that replaces an RL task (proxy=se), or only its reward (proxy=rn, with
+the task's real dynamics). Its score comes from agents that train on nothing else.
 
   python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
   python -m sejax.run agents=[ddqn,ppo] agents.ddqn.weight=2 agents.aggregate=min
@@ -27,7 +27,7 @@ def main(overrides: Sequence[str]) -> None:
     """Learns a proxy for each configuration that the overrides describe.
 
     Raises:
-      ConfigError: for overrides that cannot be, or a run directory that cannot be used.
+      ConfigError: for invalid overrides, or a run directory that cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
     learn_all(configs_of(overrides))
@@ -57,18 +57,18 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
-    """Learns a proxy for each configuration, one after the other, in a run directory each.
+    """Learns a proxy for each configuration, one after the other; each has a run directory.
 
-    Those that differ from the one before in the seed alone run on its executable. At the end it
-    prints where everything is and what to do next, or, of several runs, a line for each. Ctrl-C
-    and SIGTERM leave at once, with exit codes 130 and 143: finished generations are saved.
+    A run that differs from the one before only in its seed uses the same executable. After a single
+    run it prints where everything is and what to do next; after several runs, a line for each.
+    Ctrl-C and SIGTERM stop at once, with exit codes 130 and 143: finished generations are saved.
 
     Returns:
       The best score of each run's search mean.
 
     Raises:
       ConfigError: if a run directory cannot be used.
-      FailedError: after the last run, if all agents of one diverged.
+      FailedError: after the last run, if all agents of some run diverged.
       OSError: if a file cannot be written; everything saved before is whole.
     """
     scores, diverged = [], []

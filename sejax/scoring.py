@@ -1,7 +1,7 @@
 """From the outcomes of a generation to the scores of its candidates.
 
-`Scoring` applies an objective to both groups of a generation, the population and the incumbent, and
-says which scores the strategy compares, and what people see.
+`Scoring` applies an objective to both groups of a generation, the population and the incumbent. It
+gives the scores that the strategy compares and the scores that people see.
 """
 
 import dataclasses
@@ -25,13 +25,13 @@ class Scores:
     """Scores of a generation.
 
     Attributes:
-      population: one for each training, those of a candidate in a row; not finite for agents that
+      population: one for each training, candidate by candidate; not finite for agents that
         diverged.
       incumbent: one for each training, the agents of a mixture in turns; agents that diverged rank
         last.
-      agent_means: the incumbent's mean with each agent of a mixture; nan where none survived.
-      incumbent_mean: the incumbent's score; nan if no training with one agent survived.
-      diverged: whether the score of a training is not finite; the incumbent's come last.
+      agent_means: the incumbent's mean with each agent of a mixture; nan if all of them diverged.
+      incumbent_mean: the incumbent's score; nan if one agent of the mixture diverged every time.
+      diverged: whether the score of a training is not finite; the incumbent's trainings come last.
     """
 
     population: Float[Array, " evaluation"]
@@ -69,7 +69,7 @@ class GenerationInfo:
     population_scores: Float[Array, " evaluation"]
     train_steps: Array  # `[training]` int32; sums may exceed 32 bits and are made on the host
     real_steps: Array  # likewise: steps on the real task
-    active: Array  # False for a generation of a run that was over
+    active: Array  # False if the run was over before this generation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +79,9 @@ class Scoring:
     Attributes:
       objective: the score of one outcome.
       mixture: the agents.
-      candidates: the numbers of those that each agent trains on.
-      evaluations: how often each candidate is evaluated, the incumbent equally often by each agent.
+      candidates: for each agent, the numbers of the candidates that it trains on.
+      evaluations: how often each candidate is evaluated; each agent evaluates the incumbent equally
+        often.
     """
 
     objective: Objective
@@ -93,14 +94,14 @@ class Scoring:
         """The scoring of a strategy's population.
 
         Raises:
-          ConfigError: if the population is too small for the mixture, or the strategy compares
-            scores of several generations where their units differ.
+          ConfigError: if the population is too small for the mixture, or if the strategy compares
+            scores across generations and their units differ.
         """
         has_one_unit = mixture.size == 1 and objective.shown is None
         must = "must compare scores within a generation with several agents or a curriculum"
         message = f"{must}; got one that remembers scores. Set es=nes."
         require(has_one_unit or not strategy.remembers_scores, "es", message)
-        # Equally many with each agent.
+        # Rounded up to equally many with each agent.
         num_evals = -(-strategy.evaluations.num_incumbent_evals // mixture.size) * mixture.size
         return cls(
             objective=objective,
@@ -110,7 +111,7 @@ class Scoring:
         )
 
     def trainings_of(self, agent_index: int) -> np.ndarray:
-        """The numbers of an agent's trainings among all of a generation."""
+        """The numbers of an agent's trainings among all trainings of a generation."""
         of_population, of_incumbent = self._numbers(agent_index)
         return np.concatenate([of_population, self._num_population + of_incumbent])
 
@@ -191,6 +192,6 @@ class Scoring:
     def _by_agent(
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
-        """A statistic of each agent's trainings, of the population alone if there are no more."""
+        """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
         by_agent = map(self.trainings_of, range(self.mixture.size))
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])

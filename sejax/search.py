@@ -1,11 +1,11 @@
-"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
+"""Search hyperparameters with Optuna. A trial is a run; its budget is a number of generations.
 
   python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
   python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
 
-The same command resumes where it stopped, or is one more worker of the same study. Searched are
-choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
-tag(log, inverse, ...) in 1 - x. Other overrides than the fields below are those of
+The same command resumes a stopped study, or adds a worker to a running one. Values to search are
+choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)) and tag(log, ...);
+tag(log, inverse, ...) is logarithmic in 1 - x. All overrides but the fields below are those of
 python -m sejax.run.
 """
 

@@ -36,17 +36,17 @@ class TrainingConfig(Options):
     The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`.
 
     Attributes:
-      max_episodes: n_e: of a training at most
-      min_steps: The stop rule waits for so many training steps.
-      max_steps: Training ends after so many steps, whatever the rule says.
+      max_episodes: n_e: most episodes of a training
+      min_steps: Training steps before the stop rule may end a training.
+      max_steps: Training ends after this many steps, whatever the stop rule says.
       stop_rule: plateau (SEs), solved (real tasks)
       window: d: episodes in each of the two means that the plateau rule compares
       plateau_tolerance: C_diff: relative change between them that counts as flat
-      solved_by: Whose last d returns must reach the solved reward.
+      solved_by: The returns (of tests or of training) whose last d must reach the solved reward.
       test_episodes: n_te: greedy episodes on the real task after training
-      tests_between: Greedy episodes on the real task after each training episode; the solved rule
-        by tests has at least one.
-      time_limit_is_terminal: A real episode cut by the limit does not bootstrap, as in the paper.
+      tests_between: Greedy episodes on the real task after each training episode; at least one
+        with stop_rule=solved and solved_by=test.
+      time_limit_is_terminal: Targets do not bootstrap at a real time limit, as in the paper.
     """
 
     group: ClassVar[str] = "training"
@@ -64,7 +64,7 @@ class TrainingConfig(Options):
 
     @property
     def is_fixed_length(self) -> bool:
-        """Whether all agents train for as many steps, but for those that run out of episodes."""
+        """Whether all agents train for equally many steps, unless they run out of episodes."""
         return self.stop_rule == "never" and self.max_steps is not None
 
     @property
@@ -79,12 +79,12 @@ class TrainingConfig(Options):
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
-    """Checks that a training of fixed length does not run out of episodes before.
+    """Checks that a training of fixed length does not run out of episodes.
 
     Args:
-      name: of the group of fields.
+      name: name of the group of fields.
       training: the limits.
-      max_episode_steps: that an episode may take.
+      max_episode_steps: most steps of an episode.
 
     Raises:
       ConfigError: if even the longest episodes are too few.
@@ -104,7 +104,7 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
 
 @struct.dataclass
 class TrainResult:
-    """What came of one training.
+    """The result of one training.
 
     Attributes:
       agent_state: the trained agent.
@@ -112,13 +112,13 @@ class TrainResult:
       episodes: finished training episodes, `[]` int32.
       returns: return of each training episode in the training world, `[max_episodes]`; nan after
         the last.
-      test_returns: mean return of the tests on the real task after each training episode, likewise;
-        None if there are no such tests.
+      test_returns: mean return of the tests on the real task after each training episode, in the
+        same form; None if there are no such tests.
       episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
         after the last.
       nonfinite: whether a number that is not finite was met: an output of the world or a weight.
       eval_steps: real steps spent on tests between training episodes, `[]` int32.
-      recorded: what the recorder has kept of the training's steps, if there was one.
+      recorded: the steps that the recorder kept, if there was a recorder.
     """
 
     agent_state: AgentState
@@ -165,29 +165,29 @@ def make_trainer(
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
-    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
+    `train` is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
     agents takes as many steps as its longest training, without copies of replay buffers. With
     `active=False` nothing is computed.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
-        reward has the agent's discount, whatever its params say. The plateau rule
-        reads the returns of this world; for tests on the real task see `sejax.make_evaluator`. In a
-        proxy whose params allow longer episodes than its task the buffer may hold fewer steps than
-        the agent asks for.
-      training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
-        ignored in an SE: there the last step of an episode bootstraps with what the done network
-        says, as in the authors' code.
+        reward takes the agent's discount, whatever its params say. The plateau rule reads the
+        returns of this environment; for tests on the real task see `sejax.make_evaluator`. If a
+        proxy's params allow longer episodes than its task, the buffer may hold fewer steps than the
+        agent asks for.
+      training: stopping rule and limits. `time_limit_is_terminal` concerns real time limits and is
+        ignored in an SE. There the last step of an episode bootstraps with the done network's
+        output, as in the authors' code.
       solved_reward: for `stop_rule="solved"`.
       test_fn: plays tests on the real task; called after each training episode if
         `training.num_tests_between` is not 0.
-      recorder: keeps steps for whoever looks at the training, as an agent's `buffer` does for the
-        agent; what it kept is `TrainResult.recorded`.
-      in_batches: whether `vmap` takes as many agents at a time on a CPU as are fastest.
+      recorder: keeps steps for the caller, as an agent's `buffer` does for the agent; they are
+        `TrainResult.recorded`.
+      in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
 
     Raises:
-      ConfigError: for arguments of other kinds, or if `training` has a fixed number of steps and
+      ConfigError: for arguments of the wrong kind, or if `training` has a fixed number of steps and
         too few episodes for them.
       ValueError: if tests are asked for and no `test_fn` is given.
 
@@ -228,7 +228,7 @@ def make_trainer(
 
 
 def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
-    """Agents in a vmapped batch of a CPU core; None for all, 1 if they may stop at any time."""
+    """Agents in a vmapped batch of a CPU core; None for all; 1 if each may stop at its own time."""
     num_parallel = agent.spec.cpu_num_parallel
     return num_parallel if num_parallel is None or training.is_fixed_length else 1
 
@@ -310,7 +310,7 @@ class _Loop:
         )
 
     def buffers(self, state: _LoopState) -> list[Buffer]:
-        """What the agent keeps of its steps, and what the recorder does."""
+        """The agent's buffer, and then the recorder's if there is a recorder."""
 
         def example() -> Transition:
             act = self.agent.act
@@ -323,7 +323,7 @@ class _Loop:
     def rollout(
         self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
     ) -> tuple[PyTree, _LoopState]:
-        """So many steps, or fewer where the training ends, and what is learned from all of them."""
+        """Makes `length` steps and learns from them. A training that ends before learns nothing."""
 
         def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
             large, state = carry
@@ -350,7 +350,7 @@ class _Loop:
         keys: Sequence[Array],
         agent_state: AgentState,
     ) -> AgentState:
-        """One update, after a step that made the transition."""
+        """One update, after the step that made `transition`."""
         _, _, key_sample, key_update, *_ = keys
         size = self.agent.batch_size(agent_state)
         buffer, *_ = self.buffers(state)
@@ -377,7 +377,7 @@ class _Loop:
         discount = jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
         transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
-        finished = ended & active  # an episode that counts
+        finished = ended & active  # not in a training that is over
         stored = tuple(
             buffer.store(arrays, state.step, transition, ended, active)
             for buffer, arrays in zip(buffers, stored, strict=True)
@@ -422,8 +422,8 @@ class _Loop:
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
-        Under `vmap` this runs for all agents if it runs for one; `finished` spares the others the
-        test.
+        Under `vmap` this runs for all agents if it runs for one. Only agents that have `finished`
+        are tested.
         """
         key_reset, key_test = keys
         judged = state.episode_return
@@ -465,7 +465,7 @@ class _Loop:
 def is_plateau(
     recent: Float[Array, " two_windows"], num_episodes: Array, tolerance: float
 ) -> Array:
-    r"""Whether the mean return of the last d episodes is close to that of the d before.
+    r"""Whether the mean returns of the last d episodes and of the d episodes before are close.
 
     .. math:: |\bar C_d - \bar C_{2d}| / |\bar C_{2d}| \le C_{diff}
 
