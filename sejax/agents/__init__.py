@@ -1,7 +1,7 @@
-"""Agents: bundles of pure functions, a file each with configuration and learning.
+"""Agents: bundles of pure functions. Each agent has a file with its configuration and learning.
 
-Parts of your own agent are here too: `AgentOptions` for its configuration, `traced` for the
-hyperparameters that compiled programs take as arguments, and the buffers.
+Here are also the parts for an agent of your own: `AgentOptions` for its configuration, `traced` for
+the hyperparameters that compiled programs take as arguments, and the buffers.
 """
 
 import dataclasses
@@ -52,8 +52,8 @@ def make_agent(
         Agent Hyperparameters").
 
     Raises:
-      ConfigError: if the agent does not fit the task's observations or actions, or the exploration
-        the agent; or if none of a varied agent's options says how it is drawn.
+      ConfigError: if the agent does not fit the task's observations or actions, if the exploration
+        does not fit the agent, or if a varied agent has no option with `varied` set.
 
     Example:
       >>> import sejax
@@ -92,17 +92,17 @@ def require_fit(
     task_name: str,
     field: str = "agent",
 ) -> None:
-    """Checks that an agent can act in a task, and that it can explore so.
+    """Checks that an agent fits a task, and that an exploration fits the agent.
 
     Args:
-      agent: its configuration.
-      exploration: that of its intrinsic reward.
-      spec: of the task.
+      agent: configuration of the agent.
+      exploration: configuration of its intrinsic reward.
+      spec: spaces of the task.
       task_name: for messages.
-      field: of the agent, for messages.
+      field: field of the agent, for messages.
 
     Raises:
-      ConfigError: if it cannot.
+      ConfigError: if one of them does not fit.
     """
     if not _fits(agent, spec):
         known, got = fitting(spec), shortened(registry.name_of("agent", agent))
@@ -121,7 +121,7 @@ def require_fit(
 def default_for(spec: TaskSpec) -> str:
     """The default agent of a task: the first that fits it."""
     known = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
-    return next(known, DEFAULTS[0])  # which `require_fit` refuses, if none does
+    return next(known, DEFAULTS[0])  # if none fits, `require_fit` refuses this one
 
 
 def fitting(spec: TaskSpec) -> list[str]:

@@ -23,8 +23,8 @@ class Hparams(SimpleNamespace):
     """Traced hyperparameters of an agent, a pytree; see `traced`.
 
     Attributes:
-      hidden_size: units in use, where they vary; None for all.
-      batch_size: columns of a batch in use, likewise.
+      hidden_size: units in use; None for all.
+      batch_size: columns of a batch in use; None for all.
     """
 
     hidden_size: Array | None = None
@@ -58,12 +58,12 @@ class AgentSpec:
     """What is known of an agent before it is compiled.
 
     Attributes:
-      warmup_episodes: episodes at the start of which no stop rule may judge.
+      warmup_episodes: initial episodes in which no stop rule may end the training.
       learns_from: first episode, counted from 0, in which the agent learns.
       action_repeat: environment steps for each decision.
-      cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
-        busy alone, a table does not.
-      sizes: `sizes_of` the spaces that it is made for, set by `sejax.make_agent`; None if
+      cpu_num_parallel: `vmap` width on one CPU core; None for all agents. One network keeps a core
+        busy, one table does not.
+      sizes: `sizes_of` the spaces that the agent is made for, set by `sejax.make_agent`; None if
         unknown.
     """
 
@@ -76,14 +76,14 @@ class AgentSpec:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Agent:
-    """What the inner loop needs of an agent. All functions are pure and act on one agent.
+    """The functions of an agent for the inner loop. All are pure and act on one agent.
 
-    Build an agent once: what is compiled for it is kept by identity.
+    Build an agent once: compiled programs are kept by the identity of the object.
 
     Attributes:
       init: `(key, hparams) -> state`.
       act: `(key, state, obs, explore) -> action`, as the buffer keeps it.
-      update: `(key, state, batch) -> state`; one learning step on what `buffer` hands out.
+      update: `(key, state, batch) -> state`; one learning step on a batch from `buffer`.
       buffer: how steps are kept, from `sejax.agents.buffers`.
       hparams: the default traced hyperparameters, a pytree of floats.
       spec: what is known before it is compiled.
@@ -91,7 +91,7 @@ class Agent:
       env_action: `action -> action` as the environment takes it.
       discount: `hparams -> []`, gamma, which a potential-based reward needs; None if the agent has
         none.
-      batch_size: `state -> []`, columns of a batch in use where hyperparameters vary; None for all.
+      batch_size: `state -> []`, columns of a batch in use if hyperparameters vary; None for all.
       varied: how hyperparameters are drawn for each training; None if they are not.
     """
 
@@ -112,14 +112,14 @@ class Agent:
         raise TypeError(f"An agent holds functions and cannot be pickled. {fix}")
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
-        """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.
+        """Builds `run(key, *args)` for a fresh agent. Varied hyperparameters are drawn first.
 
         Args:
           make_run: builds `run(key, *args, hparams)` for one agent.
 
         Returns:
-          The run of this agent with its own hyperparameters; or, if they are drawn, of the variant
-          that has room for those drawn from `key`.
+          The run of this agent with its own hyperparameters. If hyperparameters are varied, the run
+          draws them from `key` and uses the variant with room for them.
         """
         if self.varied is None:
             run_self = make_run(self)
@@ -144,9 +144,9 @@ class Varied(NamedTuple):
     """Hyperparameters that are drawn for each training; see `sejax.agents.varied`.
 
     Attributes:
-      agents: agents of several sizes, of which each training takes one.
+      agents: agents of several sizes; each training takes one of them.
       draw: `key -> (variant, hparams, values)`: the index of the training's agent, `[]` int32; its
-        traced hyperparameters; and what was drawn, `[]` each, by the configuration's fields.
+        traced hyperparameters; and the drawn values, `[]` each, by field of the configuration.
     """
 
     agents: tuple[Agent, ...]
@@ -154,17 +154,17 @@ class Varied(NamedTuple):
 
 
 def drawing_key(key: Array) -> Array:
-    """The part of a training's key that its hyperparameters are drawn from."""
-    return jax.random.fold_in(key, 0x48_50)  # training and test keys are splits of the key
+    """The key from which a training's hyperparameters are drawn, given the training's key."""
+    return jax.random.fold_in(key, 0x48_50)  # not `split`, which makes training and test keys
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Options):
-    """An agent's configuration: what it fits, and what it makes. Every agent's is a subclass.
+    """An agent's configuration: which tasks it fits, and how it is made. Each agent has a subclass.
 
     Attributes:
-      states: the observations that it fits, "vector" or "discrete"; None for both.
-      actions: the actions that it fits, of "discrete" and "continuous".
+      states: kind of observations that it fits, "vector" or "discrete"; None for both.
+      actions: kinds of actions that it fits: "discrete", "continuous" or both.
     """
 
     group: ClassVar[str] = "agent"
@@ -179,8 +179,8 @@ class AgentConfig(Options):
         """Training steps before the agent first learns.
 
         Args:
-          max_episode_steps: limit of the episodes that it trains on, which may all last so long.
-          task_max_steps: limit of the task that it was made for.
+          max_episode_steps: step limit of training episodes, all of which may last that long.
+          task_max_steps: step limit of the task that the agent was made for.
         """
         return 0
 
@@ -208,10 +208,10 @@ class AgentOptions(AgentConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ExplorationConfig(Options):
-    """The configuration of an intrinsic reward: what it fits, and what it makes.
+    """The configuration of an intrinsic reward: which agents it fits, and how it is added.
 
     Attributes:
-      states: the observations of the agents that it fits, "vector" or "discrete"; None for both.
+      states: kind of observations of fitting agents, "vector" or "discrete"; None for both.
     """
 
     group: ClassVar[str] = "exploration"
@@ -242,19 +242,19 @@ def traced(config: Options) -> Hparams:
 
 
 def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
-    """Traced hyperparameters with these values; those of a wrapped agent are its field `agent`."""
+    """Traced hyperparameters with these values. A wrapped agent's are in the field `agent`."""
     if hasattr(hparams, "agent"):
         return hparams.replace(agent=with_hparams(hparams.agent, values))
     return hparams.replace(**values)
 
 
 class Learner(ABC):
-    """The pure functions of an agent, which `agent` bundles; an algorithm is a subclass.
+    """The pure functions of an agent; `agent` bundles them. Each algorithm is a subclass.
 
-    Its state has the traced hyperparameters as `hparams`.
+    The agent's state has the traced hyperparameters as `hparams`.
 
     Attributes:
-      config: with a `discount` among its traced options.
+      config: its configuration; has a traced option `discount`.
     """
 
     config: AgentOptions

@@ -1,4 +1,4 @@
-"""What an agent keeps of its steps, and what of it each learning step sees.
+"""What an agent keeps of its steps, and what each learning step reads of it.
 
 A transition is one float32 row, so that storing is a single write and sampling a single gather.
 """
@@ -40,9 +40,9 @@ class Transition(NamedTuple):
 
     @property
     def rows(self) -> "Transition":
-        """A feature-major batch turned: `[batch, obs_dim]`, with a weight `[batch]` for each row.
+        """A feature-major batch transposed to `[batch, obs_dim]`, with weights `[batch]`.
 
-        Under `jax.vmap` a function of one transition then takes a batch.
+        A `jax.vmap` of a function of one transition takes it.
         """
         weight = jnp.broadcast_to(self.weight, self.reward.shape)
         return jax.tree.map(jnp.transpose, self._replace(weight=weight))
@@ -83,9 +83,9 @@ class Buffer:
       store: `(arrays, step, transition, ended, active) -> arrays`; writes the `step`-th step, and
         nothing if `active` is False. `ended` says whether the episode ended with it.
       batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
-        `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
-        is not None, have weight 0.
-      learns_every: steps from one update to the next; above 1 `batch` has no transition but None.
+        `num_steps` steps; `transition` is the last of them. If `batch_size` is not None, columns
+        from that number on have weight 0.
+      learns_every: steps from one update to the next; above 1 `batch` gets None as `transition`.
     """
 
     init: Callable[[], PyTree]
@@ -94,8 +94,7 @@ class Buffer:
     learns_every: int = 1
 
 
-# `(example, max_steps) -> Buffer`: for transitions like `example`, of which there are at most
-# `max_steps`.
+# `(example, max_steps) -> Buffer`: for at most `max_steps` transitions, shaped like `example`.
 BufferMaker = Callable[[Transition, int], Buffer]
 
 
@@ -119,7 +118,7 @@ def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
 
 
 def rollout_buffer(length: int) -> BufferMaker:
-    """The last `length` steps in order, overwritten when they have been learned from."""
+    """The last `length` steps in order, overwritten once the agent has learned from them."""
 
     def make(example: Transition, max_steps: int) -> Buffer:
         shape = (length, row_width(*_dims(example)) + 1)
@@ -157,7 +156,7 @@ def _dims(example: Transition) -> tuple[int, int | None]:
 
 
 def row_width(obs_dim: int, action_dim: int | None = None) -> int:
-    """Number of floats in a packed transition; `action_dim` is None for an action's index."""
+    """Number of floats in a packed transition; `action_dim` is None if actions are indices."""
     return 2 * obs_dim + (action_dim or 1) + 2
 
 
@@ -189,10 +188,10 @@ def unpack(rows: Float[Array, "width batch"], action_dim: int | None = None) -> 
 def write_row(
     rows: Rows, step: Int[Array, ""], row: Float[Array, " width"], active: Array | bool = True
 ) -> Rows:
-    """Writes the row of the agent's `step`-th step into the ring, over the oldest when it is full.
+    """Writes the row of the agent's `step`-th step into the ring; a full one loses its oldest row.
 
-    The write is dropped where `active` is False: an index out of range costs nothing, where a
-    select would copy the buffer.
+    If `active` is False, an index out of range drops the write. That costs nothing; a select would
+    copy the buffer.
     """
     capacity = rows.shape[0]
     if active is True:
@@ -220,11 +219,11 @@ def sample(
       num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
       batch_size: number of rows to draw (static).
       action_dim: length of an action, or None if it is an index.
-      in_use: how many of the columns count, `[]`; None for all of them.
+      in_use: number of columns that count, `[]`; None for all columns.
 
     Returns:
-      A batch whose width is `batch_size` rounded up to whole vectors of the CPU, or with `in_use`
-      to whole blocks of a batch; the columns beyond what was asked for have weight 0.
+      A batch. Its width is `batch_size` rounded up to whole vectors of the CPU or, with `in_use`,
+      to whole blocks of a batch. Columns beyond the number asked for have weight 0.
 
     Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
     """
@@ -251,8 +250,9 @@ def _gather(flat: Float[Array, " n"], index: Int[Array, "width batch"]) -> Array
 def _gather_outlined(flat: Array, index: Array) -> Array:
     """The gather as a computation of its own.
 
-    XLA would fuse it with what makes the indices and hash each row's index anew for each of its
-    numbers; with several devices in a process it would then also hand half of that to another core.
+    Otherwise XLA would fuse it with the computation of the indices, and hash a row's index again
+    for each number of the row. With several devices in a process it would also hand half of that
+    work to another core.
     """
     with set_xla_metadata(inlineable="false"):
         return jax.jit(_gather)(flat, index)
@@ -263,8 +263,8 @@ def sample_indices(
 ) -> Int[Array, " batch"]:
     """Uniform indices in [0, size): a hash of `seed` and column.
 
-    threefry takes half as long as the learning step at these sizes. The hash is the finaliser
-    of MurmurHash3 on a Weyl sequence; 24 of its bits choose the index, so that the bias is below
+    At these sizes threefry would take half as long as the learning step. The hash is the finaliser
+    of MurmurHash3 on a Weyl sequence. 24 of its bits choose the index, so that the bias is below
     size / 2**24.
     """
     counter = jnp.arange(batch_size, dtype=jnp.uint32)
@@ -274,11 +274,11 @@ def sample_indices(
     return jnp.minimum(index, size - 1)  # rounding may reach size
 
 
-# --- batches of which only the first columns are in use ------------------------------------------
+# --- batches with only the first columns in use --------------------------------------------------
 
 
 def num_columns(batch: Transition) -> Array | float:
-    """Columns of a batch that count, i.e. do not only fill it up."""
+    """Number of columns of a batch that count. Other columns only fill the batch up."""
     return jnp.sum(jnp.broadcast_to(batch.weight, batch.reward.shape))
 
 
@@ -288,14 +288,14 @@ def block_size(width: int) -> int:
 
 
 def sum_over_batch(fn: Callable[[PyTree], T], batch: PyTree, batch_size: Array | None) -> T:
-    """Sum of `fn` over the columns of a batch, at the cost of those that are in use.
+    """Sum of `fn` over the columns of a batch; blocks without columns in use cost nothing.
 
     Args:
-      fn: of a batch, a pytree of sums over its columns, in which those of weight 0 count nothing.
-      batch: pytree of arrays whose last axis are the columns, as many as `sample` draws; scalars
-        belong to all of them.
-      batch_size: columns that count, from the first on, `[]`; the others must have weight 0. None
-        for all, in one go.
+      fn: maps a batch to a pytree of sums over its columns. Columns of weight 0 must add nothing.
+      batch: pytree of arrays. Their last axis has the columns, as many as `sample` draws; scalars
+        belong to all columns.
+      batch_size: number of columns that count, from the first on, `[]`; the others must have weight
+        0. None for all columns, in one go.
 
     Returns:
       What `fn(batch)` returns, up to the order of summation.

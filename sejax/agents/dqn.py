@@ -35,9 +35,9 @@ class DDQNConfig(OffPolicyOptions):
     Attributes:
       epsilon_init: share of random actions
       epsilon_decay: factor for each episode
-      exploration_steps: If given, epsilon falls linearly in so many steps from when the agent first
-        learns, whatever the episodes: for environments whose episodes have one or two steps.
-      double: the online network chooses a target's action; else the target network
+      exploration_steps: If given, epsilon falls linearly over this many steps after the agent first
+        learns, not by episodes: for environments whose episodes have one or two steps.
+      double: the online network chooses the action in a target; else the target network does
     """
 
     epsilon_init: Fraction = option(1.0, traced=True)
@@ -143,7 +143,7 @@ class DDQN(OffPolicy):
         )
 
     def begin_episode(self, state: DDQNState, episode: Array) -> DDQNState:
-        """The share of random actions in the episode, unless it falls with steps."""
+        """Sets the share of random actions in the episode, unless it falls with steps."""
         hp = state.hparams
         if hp.exploration_steps is not None:
             return state
@@ -161,7 +161,7 @@ class DDQN(OffPolicy):
         return epsilon_greedy(key, q_values, state.epsilon)
 
     def update(self, key: Array, state: DDQNState, batch: Transition) -> DDQNState:
-        """Adam on the loss of the error to double-Q targets; then the target network follows.
+        """A step of Adam on the error to double-Q targets; then the target network follows.
 
         Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
         """
@@ -190,7 +190,7 @@ class DDQN(OffPolicy):
 def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
     """The share of random actions `num_steps` after the agent first learned, `[]`.
 
-    It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.
+    It falls from `hparams.epsilon_init` to `epsilon_min` in `exploration_steps`, and stays there.
 
     Source: Mnih et al. (2015), extended data table 1 (final exploration frame).
     """
@@ -207,8 +207,8 @@ def double_q_targets(
     r"""Targets :math:`r + \gamma\, Q'(s', \arg\max_a Q(s', a))`.
 
     Args:
-      online_next_q: Q of the online network at the next states, by which actions are chosen. With
-        Q' in its place the targets are DQN's.
+      online_next_q: Q of the online network at the next states; it chooses the actions. With Q' in
+        its place the targets are DQN's.
       target_next_q: Q' of the target network at the next states.
       reward: in the task's units.
       discount: gamma times the transition's own discount.

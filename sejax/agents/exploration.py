@@ -1,7 +1,7 @@
-"""Intrinsic rewards: an agent that learns from rewards with a bonus for what is new to it.
+"""Intrinsic rewards: an agent learns from rewards with a bonus for what is new to it.
 
-Curiosity (ICM) pays for steps whose outcome the agent cannot yet predict, count-based exploration
-for actions that a tabular agent has rarely learned from.
+Curiosity (ICM) pays for steps whose outcome the agent cannot yet predict. Count-based exploration
+pays for actions from which a tabular agent has rarely learned.
 
 Source: Pathak et al., "Curiosity-driven Exploration by Self-supervised Prediction" (2017); Burda
 et al., "Large-Scale Study of Curiosity-Driven Learning" (2019), for the forward model's residual
@@ -32,9 +32,10 @@ from sejax.options import Count, Depth, Fraction, NonNegative, Positive, option
 
 
 def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
-    """An agent with these changes, whose state and hyperparameters hold those of the one inside.
+    """A wrapped agent with these changes.
 
-    They are the state's `agent_state` and the hyperparameters' `agent`.
+    Its state holds the inner agent's state as `agent_state`. Its hyperparameters hold the inner
+    agent's as `agent`.
     """
 
     def begin_episode(state: AgentState, episode: Array) -> AgentState:
@@ -61,8 +62,8 @@ def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agen
 class ICMConfig(ExplorationConfig):
     """Intrinsic curiosity module (paper, appendix, tables of ICM).
 
-    The defaults are the paper's values optimized for CartPole, as in the authors' scripts. Its text
-    says that all experiments have its defaults: 1e-4, 0.2, 0.5 and 64 features.
+    The defaults are the paper's values optimized for CartPole, as in the authors' scripts. The
+    paper's text says that all experiments use its defaults: 1e-4, 0.2, 0.5 and 64 features.
 
     Attributes:
       forward_weight: beta: the forward model's share of the loss
@@ -82,22 +83,21 @@ class ICMConfig(ExplorationConfig):
     def make(self, agent: Agent, task: Task) -> Agent:
         """The same agent, learning from rewards with an intrinsic bonus.
 
-        Before each learning step on `Transition`s the module takes one step of Adam on the batch;
-        then its bonus for that batch, by the models as updated, is added to the rewards that the
-        agent sees. On a `Rollout` the bonus comes first and the module's one step after it. The
-        buffer keeps rewards without the bonus, which is computed anew whenever a step is learned
-        from.
+        Before each learning step on `Transition`s the module takes one step of Adam on the batch.
+        The updated models give the bonus, which is added to the rewards that the agent sees. On a
+        `Rollout` the bonus comes first, and then the module's one step. The buffer keeps rewards
+        without the bonus; each learning step computes it anew.
 
         Discrete actions enter the models as one-hot vectors. An agent's own vectors for discrete
-        actions, as those of discrete TD3, enter as they are.
+        actions, such as those of discrete TD3, enter as they are.
 
         Args:
           agent: one that learns from batches of `Transition`s, or from a `Rollout`.
-          task: that it is for, whose observations are vectors.
+          task: the agent's task; its observations are vectors.
 
-        Differs: two discrete actions are treated as any other number of them, with two logits and a
-        softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete
-        actions are not one-hot, so that the inverse model learns them by their squared error.
+        Differs: two discrete actions are treated as any other number of actions, with two logits
+        and a softmax; the authors use the number 0 or 1 and one logit. An agent's own vectors for
+        discrete actions are not one-hot, so that the inverse model learns them by squared error.
 
         Source: `docs/reference.md` 4.8.
 
@@ -111,7 +111,7 @@ class ICMConfig(ExplorationConfig):
         """
         module = ICM(self, task.action_dim)
         curious = Curious(agent, module, task.obs_dim, task.num_actions is not None)
-        # The module's networks keep a core busy, whatever the agent's.
+        # The module's networks keep a core busy, whatever agent is inside.
         spec = dataclasses.replace(agent.spec, cpu_num_parallel=1)
         return _with_bonus(agent, self, init=curious.init, update=curious.update, spec=spec)
 
@@ -288,7 +288,7 @@ def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
 
 
 class CountingState(struct.PyTreeNode):
-    """One counting agent: the state of the agent inside, and the learning steps on each pair."""
+    """One counting agent: the inner agent's state, and the learning steps on each pair."""
 
     agent_state: AgentState
     counts: Int[Array, "num_states num_actions"]
@@ -314,12 +314,12 @@ class CountBasedConfig(ExplorationConfig):
 
         .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
 
-        for the step at hand, before the learning step of the agent inside.
+        for the current step, before the inner agent's learning step.
 
         Args:
           agent: one that learns from single steps with indices as observations and actions, from
             `sejax.agents.tabular`.
-          task: that it is for.
+          task: the agent's task.
 
         Example:
           >>> import sejax

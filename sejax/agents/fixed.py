@@ -11,10 +11,10 @@ from sejax.envs.base import Task
 
 
 def make_fixed(task: Task, act: Callable[[Array, Any, Array], Array]) -> Agent:
-    """A policy as an agent, whose state is what the policy needs.
+    """A policy as an agent. The agent's state is whatever the policy needs.
 
     Args:
-      task: whose observations and actions it takes.
+      task: gives the observations and actions.
       act: `(key, state, obs) -> action`.
 
     Example:

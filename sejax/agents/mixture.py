@@ -1,8 +1,8 @@
-"""A mixture of agents, one of which trains on each candidate of a generation.
+"""A mixture of agents. Each candidate of a generation trains one of them.
 
-A proxy that is learned with one agent teaches that agent; whether it teaches others is left to
-chance. Here the candidates of a generation are divided among several agents, so that a step of the
-outer loop helps all of them, at the same number of trainings.
+A proxy learned with one agent teaches that agent; whether it teaches others is left to chance. A
+mixture divides the candidates of a generation among several agents. So a step of the outer loop
+helps all agents, with the same number of trainings.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class MixtureConfig(Options):
     """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line.
 
     Attributes:
-      aggregate: Each agent scores the search mean; its score is the mean of theirs, or the worst.
+      aggregate: Each agent scores the search mean; the mean of these scores counts, or the worst.
     """
 
     group: ClassVar[str] = "agents"
@@ -34,7 +34,7 @@ class MixtureConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """Agents among which the candidates of a generation are divided.
+    """Agents that share the candidates of a generation.
 
     Attributes:
       agents: from `sejax.make_agent`, or your own.
@@ -44,7 +44,8 @@ class Mixture:
       config: how the agents' scores are combined.
 
     Raises:
-      ConfigError: for no agents, other numbers of names and weights, a weight below 0, or all 0.
+      ConfigError: without agents, unless each has a name and a weight, for a weight below 0, or if
+        all weights are 0.
 
     Example:
       >>> import sejax
@@ -90,9 +91,9 @@ class Mixture:
     def deal(self, population_size: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
         """The candidates of each agent: their numbers in the population, ascending.
 
-        One candidate after the other goes to the agent that is furthest behind its share; an agent
-        of weight 0 gets none. Both candidates of an antithetic pair have the same agent, as they
-        are compared with each other.
+        Each candidate in turn goes to the agent that is furthest behind its share; an agent of
+        weight 0 gets none. The two candidates of an antithetic pair are compared with each other,
+        so that they get the same agent.
 
         Raises:
           ConfigError: if an agent with a weight gets no candidate.
@@ -118,16 +119,16 @@ class Mixture:
         candidates: Sequence[np.ndarray],
         incumbent_means: Float[Array, " agent"],
     ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
-        """Scores of candidates with different agents in one unit, and the incumbent's.
+        """Scores of candidates with different agents in one unit, and the incumbent's score.
 
-        They are advantages over the incumbent's mean with the same agent. Those of a single agent
-        stay as they are.
+        The scores become advantages over the incumbent's mean with the same agent. With a single
+        agent they stay as they are.
 
         Args:
-          scores: of the candidates; not finite where training diverged, and then they stay so.
+          scores: of the candidates; a score is not finite if training diverged, and stays so.
           candidates: of each agent, as from `deal`.
-          incumbent_means: nan for an agent that no evaluation of the incumbent survived with; its
-            candidates are then compared with their own mean.
+          incumbent_means: the incumbent's mean with each agent; nan if all evaluations with the
+            agent diverged. The agent's candidates are then compared with their own mean.
         """
         if self.size == 1:
             return scores, incumbent_means[0]

@@ -1,7 +1,7 @@
 """The frame of the agents that learn from a replay buffer: DDQN, TD3 and SAC.
 
-It has their options, when they warm up, how a batch is drawn, and the step of Adam on its mean
-loss. The file of an agent has its networks, its loss and its targets.
+It has their options, their warm-up, how a batch is drawn, and the step of Adam on its mean loss.
+Each agent's own file has its networks, its loss and its targets.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ Params = TypeVar("Params")  # a pytree
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyOptions(AgentOptions):
-    """Hyperparameters of an agent that learns at each step from a batch of earlier ones.
+    """Hyperparameters of an agent that learns at each step from a batch of earlier steps.
 
-    The defaults are small agents, quick to learn within 2,000 steps (`docs/agents.md`);
-    `preset=paper` has the paper's.
+    The defaults make small agents that learn within 2,000 steps (`docs/agents.md`); `preset=paper`
+    has the paper's.
 
     Attributes:
       batch_size: transitions
@@ -89,7 +89,7 @@ class OffPolicy(Learner):
 
 
 class ActorCritic(OffPolicy):
-    """One that acts at random in its first episodes; its state says so as `is_warming_up`."""
+    """An off-policy agent that acts at random while its state's `is_warming_up` is set."""
 
     def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
         return state.replace(is_warming_up=jnp.asarray(episode < self.config.warmup_episodes))
@@ -102,13 +102,13 @@ def adam_step(
     columns: tuple[Transition, *tuple[PyTree, ...]],
     hparams: Hparams,
 ) -> tuple[Params, optax.OptState]:
-    """One step of Adam on a batch's mean loss, at the cost of the columns in use.
+    """One step of Adam on a batch's mean loss; only blocks with columns in use cost time.
 
     Args:
       sum_of_losses: `(params, *columns) -> []`, the losses of the columns times their weights.
-      params: to move.
+      params: the parameters to move.
       opt_state: of `sejax.ops.optimizers.ADAM`.
-      columns: a batch, and what else has its columns, such as noise.
+      columns: a batch, and other arrays with the same columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
     """
 

@@ -1,4 +1,4 @@
-"""How actions come of their values."""
+"""How actions are chosen by their values."""
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +28,9 @@ def decayed_epsilon(
 def epsilon_greedy(
     key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
 ) -> Int[Array, ""]:
-    """A uniform action with probability epsilon, else the first of the best.
+    """A uniform action with probability epsilon, else the first of the best actions.
 
-    The key's own words decide; it must not be used for anything else.
+    The random bits are the key's own data: do not use the key for anything else.
     """
     bits = jax.random.key_data(key)
     random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)

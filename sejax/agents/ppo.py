@@ -1,13 +1,13 @@
 """PPO with a clipped ratio, for discrete and for continuous actions.
 
 There are two ways to prepare a rollout (`PPOConfig.advantages`): `gae`, the usual generalised
-advantages, and `monte_carlo`, the returns of the paper's code, which learns from the whole rollout
-in each Adam step (`PPOConfig.paper`). All else is the same.
+advantages, and `monte_carlo`, the returns of the paper's code. The paper's code learns from the
+whole rollout in each Adam step (`PPOConfig.paper`). All else is the same.
 
 Without exploration the agent takes its most probable action. Differs: the authors also test with
-sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
-MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO has
-no counterpart in their code, nor here.
+sampled actions (`docs/reference.md` 3.7). They do not clip actions, so that MountainCarContinuous
+charges for the action as drawn. The policy delay in the paper's table for PPO has no counterpart in
+their code, nor here.
 
 Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schulman et al.,
 "High-Dimensional Continuous Control Using Generalized Advantage Estimation" (2016); the paper's
@@ -60,13 +60,13 @@ class PPOConfig(AgentOptions):
 
     Attributes:
       rollout_steps: Decisions between two learning phases; null: as `update_episodes` says.
-      update_episodes: of full length, between two learning phases
+      update_episodes: episodes of full length between two learning phases
       epochs: passes over the rollout in a learning phase
-      num_minibatches: Adam steps in an epoch, each on its part of it
-      gae_lambda: of advantages=gae
+      num_minibatches: Adam steps in an epoch, each on one part of the rollout
+      gae_lambda: lambda of advantages=gae
       normalize_rewards: Divides rewards by the running std of returns, with advantages=gae.
-      max_grad_norm: Norm that a longer gradient is scaled down to.
-      init_action_std: Of the Gaussian policy; learned.
+      max_grad_norm: A gradient with a larger norm is scaled down to this norm.
+      init_action_std: Initial std of the Gaussian policy, which is learned.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -93,9 +93,9 @@ class PPOConfig(AgentOptions):
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:
-        """The paper's PPO, but for these changes: its table and, where that is silent, its code.
+        """The paper's PPO with `changes`. Where the paper's table is silent, its code counts.
 
-        Those are its values for MountainCarContinuous, whose RNs add `action_repeat=5`.
+        The values are those for MountainCarContinuous, whose RNs add `action_repeat=5`.
 
         Source: the paper's appendix, tables of PPO; `docs/reference.md` 4.5.
 
@@ -131,8 +131,8 @@ class PPOConfig(AgentOptions):
         """Decisions between two learning phases: `rollout_steps`, if that is set.
 
         The authors learn as soon as (decisions x `action_repeat`) / `task_max_steps` exceeds
-        `update_episodes`, also in the middle of an episode; this is the first whole number that
-        does.
+        `update_episodes`, also in the middle of an episode. This is the smallest such number of
+        decisions.
 
         Source: `docs/reference.md` 4.5.
         """
@@ -141,7 +141,7 @@ class PPOConfig(AgentOptions):
         return self.update_episodes * task_max_steps // self.action_repeat + 1
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
-        """As of any agent; PPO learns once a rollout is full, whose length is by the task."""
+        """PPO learns once a rollout is full; the task's limit decides its length."""
         return self.rollout_length(task_max_steps) * self.action_repeat
 
     def spec(self) -> AgentSpec:
@@ -156,7 +156,7 @@ class PPOConfig(AgentOptions):
         )
 
     def optimizer(self) -> optax.GradientTransformation:
-        """Adam's direction, of a gradient that may be shortened first."""
+        """Adam's direction; with `max_grad_norm` the gradient is clipped first."""
         adam = scale_by_adam(self.adam_eps)
         if self.max_grad_norm is None:
             return adam
@@ -168,17 +168,17 @@ class PPOState(struct.PyTreeNode):
 
     params: dict[str, PyTree]
     opt_state: optax.OptState
-    return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
+    return_sums: Float[Array, "3"]  # `power_sums` of all returns; 0 if unused
     hparams: Hparams
 
 
 class Batch(NamedTuple):
-    """What a learning phase learns from, steps last: a rollout or a minibatch of it.
+    """A rollout or a minibatch of it, as a learning phase uses it. The last axis is steps.
 
     Attributes:
       old_log_prob: of the actions when the rollout was made, in nats.
-      advantage: of the actions; None for `returns` less the critic's present value.
-      returns: what the critic is to predict.
+      advantage: of the actions; None for `returns` minus the critic's current value.
+      returns: targets of the critic.
     """
 
     obs: Float[Array, "obs_dim steps"]
@@ -191,12 +191,12 @@ class Batch(NamedTuple):
 class PPO(Learner):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    Parameters have the keys actor, whose outputs are logits, critic and std.
+    Parameters have the keys actor, critic and std. The actor's outputs are logits.
 
     Args:
       config: hyperparameters.
       obs_dim: length of an observation.
-      action_dim: number of actions, or the length of a continuous one: outputs of the actor.
+      action_dim: number of the actor's outputs: of actions, or the length of a continuous one.
       length: decisions between two learning phases.
       max_action: the largest continuous action; None for discrete ones.
 
@@ -256,7 +256,7 @@ class PPO(Learner):
         return self.sample(key, outputs, state.params["std"]) if explore else self.mode(outputs)
 
     def value(self, params: PyTree, obs: Array) -> Steps:
-        """The critic's."""
+        """The critic's values."""
         outputs: Any = self.critic.apply(params["critic"], obs)
         return outputs[0]
 
@@ -270,7 +270,7 @@ class PPO(Learner):
         """A learning phase.
 
         It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
-        steps. A rollout that these do not divide leaves some steps out of each pass.
+        steps. If this number does not divide the rollout, each pass leaves some steps out.
         """
         config, hp = self.config, state.hparams
         steps = batch.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
@@ -296,24 +296,24 @@ class PPO(Learner):
     def prepared(
         self, state: PPOState, steps: Transition, ended: Steps
     ) -> tuple[Batch, Float[Array, "3"]]:
-        r"""A rollout by the parameters that made it, and the agent's sums over all returns so far.
+        r"""A rollout, evaluated by the parameters that made it, and the sums over all returns so far.
 
-        With `advantages="monte_carlo"` returns are normalised, and the advantage is that over the
-        value which the critic has in each Adam step (`docs/reference.md` 4.5). Nothing is
-        bootstrapped: an episode counts as over where it was cut, and where the rollout is. Differs:
-        the authors restart where the stored `done` exceeds 0.5, which in an SE is not so at a time
-        limit; returns there run on into the next episode.
+        With `advantages="monte_carlo"` returns are normalised. The advantage is the return minus
+        the critic's value in each Adam step (`docs/reference.md` 4.5). Nothing is bootstrapped: an
+        episode counts as over at a time limit and at the end of the rollout. Differs: the authors
+        restart the sums where the stored `done` exceeds 0.5. In an SE it does not at a time limit,
+        and their returns run on into the next episode.
 
-        With `"gae"` the advantages are generalised ones, of rewards that `normalize_rewards`
-        divides by the std of returns:
+        With `"gae"` advantages are generalised. With `normalize_rewards` the rewards are first
+        divided by the std of returns:
 
         .. math::
           A_t &= \delta_t + \gamma_t \lambda A_{t+1}, \quad
           \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
 
-        within each episode, gamma times the transition's own discount, which is 0 where the episode
-        terminated. At a time limit, and where the rollout is cut, the critic's value of the next
-        state stands for what would have come.
+        within each episode. :math:`\gamma_t` is gamma times the transition's own discount, which is
+        0 where the episode terminated. At a time limit, and at the end of the rollout, the critic's
+        value of the next state stands for the missing rewards.
 
         Source: Schulman et al. (2016), eq. 11 to 16.
         """
@@ -353,7 +353,7 @@ class PPO(Learner):
         value_error = jnp.mean((value - batch.returns) ** 2)
         return -surrogate + hp.value_weight * value_error - hp.entropy_weight * jnp.mean(entropy)
 
-    # What continuous actions differ in.
+    # Methods that continuous actions override.
 
     def sample(self, key: Array, outputs: Array, std: Array) -> Array:
         """An action, for one observation."""
@@ -377,7 +377,7 @@ class ContinuousPPO(PPO):
     its range.
 
     Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
-    whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
+    whose largest action is not 1, such as Pendulum. Both stds are in units of the action.
 
     Source: `docs/reference.md` 4.5.
     """
@@ -403,11 +403,11 @@ class ContinuousPPO(PPO):
 def shuffled(
     key: Array, epochs: int, num_minibatches: int, num_steps: int
 ) -> Int[Array, "updates size"]:
-    """Which steps each minibatch has: in each epoch all of them, in random order.
+    """The steps of each minibatch: each epoch deals out all steps, in random order.
 
-    Each epoch's steps are sorted by random bits, whose last ones are the step's number: a sort of
-    single numbers takes a fifth of the time of `jax.random.permutation`. The bits are MurmurHash3's
-    finaliser of counters that start at random.
+    Each epoch sorts random numbers whose last bits are the number of a step. A sort of single
+    numbers takes a fifth of the time of `jax.random.permutation`. The random numbers are
+    MurmurHash3's finaliser of counters that start at random.
     """
     size = num_steps // num_minibatches
     counter = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
@@ -418,12 +418,12 @@ def shuffled(
 
 
 def power_sums(x: Steps) -> Float[Array, "3"]:
-    """How many numbers there are, their sum, and that of their squares."""
+    """The count of numbers, their sum, and the sum of their squares."""
     return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
 
 
 def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
-    """Standard deviation, and at least 1e-4, which leaves rewards finite that are always 0."""
+    """Standard deviation, at least 1e-4: rewards that are always 0 stay finite when divided."""
     count, total, squares = power_sums
     return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
 
@@ -440,11 +440,11 @@ def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
 
 
 def normalized(x: Steps) -> Steps:
-    """Numbers with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
+    """`x` less its mean, divided by its unbiased std plus 1e-5."""
     std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
     return (x - jnp.mean(x)) * (1 / (std + 1e-5))
 
 
 def bounded_exp(log_ratio: Steps) -> Steps:
-    """Its exponential, which is finite however far the policy has moved."""
+    """Exponential of a log ratio. It is finite however far the policy has moved."""
     return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))

@@ -1,7 +1,7 @@
 """Soft actor-critic, for continuous actions and for discrete ones.
 
-The two share everything but the policy: a Gaussian squashed by tanh, of which one action is drawn
-for each expectation, or a softmax, under which expectations are sums.
+The two share everything but the policy. Continuous actions have a Gaussian squashed by tanh; one
+drawn action stands for each expectation. Discrete actions have a softmax; expectations are sums.
 
 Source: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018); Christodoulou,
 "Soft Actor-Critic for Discrete Action Settings" (2019).
@@ -36,16 +36,16 @@ class SACConfig(ActorCriticOptions):
     """SAC's hyperparameters.
 
     Attributes:
-      alpha: Temperature: what a nat of entropy is worth, in reward units. None: learned, as the
-        authors do to meet a target entropy.
-      target_entropy: Of actions in [-1, 1], in nats for each dimension; a uniform one's is the
-        largest, log 2.
-      target_entropy_fraction: Of discrete actions, as a fraction of the largest, log |A|: see
-        docs/agents.md.
+      alpha: Temperature: the worth of a nat of entropy, in reward units. null: learned so that the
+        entropy meets its target, as the authors do.
+      target_entropy: Target for actions in [-1, 1], in nats for each dimension. Uniform actions
+        have the largest entropy, log 2.
+      target_entropy_fraction: Target for discrete actions, as a fraction of the largest entropy,
+        log |A|: see docs/agents.md.
 
     Differs: Haarnoja et al. (2018) have two layers of 256 units, batches of 256 out of a million
     steps, a learning rate of 0.0003 and a tau of 0.005 (table 1). Christodoulou (2019)
-    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
+    has a target entropy of 0.98 of the largest; with this target SAC does not learn CartPole.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -85,8 +85,8 @@ class LearningNoise(NamedTuple):
     """Standard normal numbers of one learning step, `[action_dim, batch]`; None if discrete.
 
     Attributes:
-      next_action: of the actions drawn for the next states.
-      action: of those drawn for the states.
+      next_action: noise of the actions drawn for the next states.
+      action: noise of the actions drawn for the states.
     """
 
     next_action: Array | None
@@ -182,7 +182,7 @@ class SAC(ActorCritic):
     def losses(
         self, params: Params, state: SACState, batch: Transition, noise: LearningNoise
     ) -> Float[Array, " batch"]:
-        r"""All three losses of a batch's columns, each with a gradient for its parameters alone.
+        r"""Sum of the three losses for each column; each has a gradient for its parameters alone.
 
         .. math::
           y &= r + \gamma d\, E[\min_i Q'_i(s', a') - \alpha \log \pi(a'|s')] \\
@@ -190,8 +190,8 @@ class SAC(ActorCritic):
           J_\pi &= E[\alpha \log \pi(a|s) - \min_i Q_i(s, a)] \\
           J_\alpha &= \log \alpha\, (E[-\log \pi(a|s)] - \bar H)
 
-        Differs: the paper's temperature loss has alpha where its logarithm stands here and in the
-        authors' code; alpha then falls and rises at a rate of its own, whatever it is.
+        Differs: the factor in the paper's temperature loss is alpha. Here and in the authors' code
+        it is log alpha; alpha then falls and rises at a rate that does not depend on its value.
 
         Source: Haarnoja et al. (2018), eq. 5, 7 and 18; Christodoulou (2019), eq. 10 to 12.
         """
@@ -215,24 +215,24 @@ class SAC(ActorCritic):
             losses = losses + params.log_alpha * excess
         return losses
 
-    # What discrete actions differ in.
+    # Methods that discrete actions override.
 
     def sizes(self) -> tuple[int, int, int]:
         """Outputs of the actor, inputs of a critic beside the observation, and its outputs."""
         return 2 * self.action_dim, self.action_dim, 1
 
     def target_entropy(self, hparams: Hparams) -> Array:
-        """In nats."""
+        """The target of the entropy, in nats."""
         return hparams.target_entropy * self.action_dim
 
     def draw(self, key: Array, batch: int) -> LearningNoise:
-        """The randomness of a learning step, for so many columns."""
+        """The random numbers of a learning step, for `batch` columns."""
         return LearningNoise(*jax.random.normal(key, (2, self.action_dim, batch)))
 
     def sample(self, key: Array, outputs: Array, is_uniform: Array) -> Array:
         """An action of the policy, or a uniform one, for one observation."""
         noise = jax.random.normal(key, (self.action_dim,))
-        uniform = jax.lax.erf(noise / math.sqrt(2))  # its distribution function, times 2, less 1
+        uniform = jax.lax.erf(noise / math.sqrt(2))  # 2 F(noise) - 1, F the normal distribution
         return jnp.where(is_uniform, uniform, squashed_gaussian(outputs, noise)[0])
 
     def best(self, outputs: Array) -> Array:
@@ -240,7 +240,7 @@ class SAC(ActorCritic):
         return jnp.tanh(outputs[: self.action_dim])
 
     def q_values(self, critics: Critics, obs: Array, action: Array) -> Float[Array, "2 batch"]:
-        """Of actions that were taken."""
+        """Both critics' values of the actions that were taken."""
         return critics(jnp.concatenate([obs, action]))[:, 0]
 
     def expected(
@@ -248,7 +248,7 @@ class SAC(ActorCritic):
     ) -> tuple[Array, Array]:
         """The lesser critic's value and the entropy, `[batch]` each, for an action drawn by noise.
 
-        Of a softmax they are expectations.
+        For a softmax policy they are expectations over the actions.
         """
         assert noise is not None
         action, log_p = squashed_gaussian(outputs, noise)
@@ -300,8 +300,8 @@ class DiscreteSAC(SAC):
 def lesser(q_values: Float[Array, "2 *values"]) -> Float[Array, "*values"]:
     """The lesser of the two critics' values.
 
-    `jnp.min` would not do: its gradient divides by how many values equal the minimum, which are
-    none where the compiler computes one of them twice and rounds it differently.
+    `jnp.min` would not do. Its gradient divides by the number of values that equal the minimum.
+    That number is 0 if the compiler computes a value twice and rounds it differently.
     """
     return jnp.minimum(q_values[0], q_values[1])
 
@@ -312,7 +312,7 @@ def squashed_gaussian(
     r"""Actions :math:`\tanh(\mu + \sigma \epsilon)` and the logarithms of their densities.
 
     Args:
-      outputs: mean and, clipped, log std.
+      outputs: mean and log std; the log std is clipped.
       noise: standard normal, `[actions, *batch]`.
 
     Source: Haarnoja et al. (2018), appendix C, eq. 26.

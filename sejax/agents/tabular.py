@@ -27,11 +27,11 @@ class QLearningConfig(AgentOptions):
 
     .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \max_{a'} Q(s', a') - Q(s, a))
 
-    with the transition's own discount d, and from Q = 0 on. It learns from each step once, when it
-    has been made.
+    with the transition's own discount d. Q starts at 0. The agent learns from each step once, right
+    after the step.
 
-    Differs: in an SE with `done="soft"` d is the learned 1 - done; the authors' tabular agents
-    bootstrap in full where done < 0.5 and not at all elsewhere, as `done="threshold"` does.
+    Differs: in an SE with `done="soft"` d is the learned 1 - done. The authors' tabular agents
+    bootstrap in full if done < 0.5 and else not at all, as with `done="threshold"`.
     """
 
     states: ClassVar[str | None] = "discrete"
@@ -54,7 +54,7 @@ class QLearningConfig(AgentOptions):
     def next_value(
         self, key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
     ) -> Float[Array, ""]:
-        """What the next state is worth to the target, given its row of Q."""
+        """The next state's value in the target, given the state's row of Q."""
         return jnp.max(q_row)
 
 
@@ -64,10 +64,10 @@ class SARSAConfig(QLearningConfig):
 
     .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \, Q(s', a') - Q(s, a))
 
-    As in the authors' code, a' is drawn by the learning step from the epsilon-greedy policy. It is
-    not the action executed next, which is drawn anew, and after this update.
+    As in the authors' code, the learning step draws a' from the epsilon-greedy policy. The agent
+    does not execute a': it draws its next action anew, after this update.
 
-    Differs: in SEs as Q-learning.
+    Differs: in SEs, as Q-learning does.
     """
 
     def next_value(
@@ -132,8 +132,8 @@ class Tabular(Learner):
 
 
 # Tables are read by index and written by mask. Under `vmap` on a CPU, reading by a mask over the
-# whole table makes a training step three times as long; writing by a mask joins the trainer's own
-# selects over the table, where a scatter is one more operation.
+# whole table would make a training step three times as long. Writing by a mask joins the trainer's
+# own selects over the table; a scatter would be one more operation.
 
 
 def row_of(table: Array, state: Int[Array, ""]) -> Array:

@@ -1,6 +1,6 @@
 """TD3, and TD3 for discrete actions, whose policy is a Gumbel-Softmax.
 
-The two share everything but what becomes of the actor's outputs.
+The two differ only in how they use the actor's outputs.
 
 Source: Fujimoto et al., "Addressing Function Approximation Error in Actor-Critic Methods" (2018);
 Jang et al., "Categorical Reparameterization with Gumbel-Softmax" (2017); the paper's
@@ -32,14 +32,14 @@ class TD3Config(ActorCriticOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
     Attributes:
-      policy_delay: learning steps for each one of actor and targets
-      action_noise_std: Exploration, in units of the largest action.
-      target_noise_std: Smoothing of the target policy, likewise.
+      policy_delay: learning steps of the critics for each one of the actor and the targets
+      action_noise_std: Exploration noise, in units of the largest action.
+      target_noise_std: Noise that smooths the target policy, in the same units.
       noisy_tests: exploration noise in tests too, as in the authors' code
 
-    Differs: the authors do not scale the target policy's noise by the largest action. That is the
-    same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
-    unless `noisy_tests` is set.
+    Differs: the authors do not scale the target policy's noise by the largest action. There is no
+    difference if the largest action is 1, as in all of the paper's tasks. Tests are without
+    exploration noise unless `noisy_tests` is set.
     """
 
     policy_delay: Count = 2
@@ -62,13 +62,13 @@ class DiscreteTD3Config(TD3Config):
 
     Attributes:
       layer_norm: after each hidden layer but the first, as in the authors' code
-      temperature: Of the Gumbel-Softmax at the start.
-      final_temperature: as a fraction of it, ...
-      temperature_steps: ... reached linearly after so many updates
+      temperature: Initial temperature of the Gumbel-Softmax.
+      final_temperature: as a fraction of the initial temperature
+      temperature_steps: updates in which the temperature falls linearly to the final one
       one_hot_actions: straight-through one-hot actions in place of soft ones
 
-    Differs: the temperature reaches its end after `temperature_steps` learning steps, in the
-    authors' code after one less. Tests take the likeliest action unless `noisy_tests` is set.
+    Differs: the temperature reaches its final value after `temperature_steps` learning steps, in
+    the authors' code one step earlier. Tests take the likeliest action unless `noisy_tests` is set.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
@@ -120,7 +120,7 @@ class LearningNoise(NamedTuple):
 class TD3(ActorCritic):
     """The agent for observations `[obs_dim]` and continuous actions `max_action * tanh(outputs)`.
 
-    Noise does not lead out of their range. Actions, and outputs of the actor, are
+    Noisy actions are clipped to that range. Actions and the actor's outputs are
     `[action_dim, *batch]`; `max_action` is the unit of all Gaussian noise.
 
     Example:
@@ -180,7 +180,7 @@ class TD3(ActorCritic):
         )
 
     def learn(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        """A step of the critics; of the actor and all targets in every `policy_delay`-th.
+        """A step of the critics and, every `policy_delay`-th time, of the actor and all targets.
 
         Source: Fujimoto et al. (2018), algorithm 1; `docs/reference.md` 4.3.
         """
@@ -233,12 +233,12 @@ class TD3(ActorCritic):
         return outputs
 
     def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
-        """What one critic says an action is worth."""
+        """One critic's value of an action."""
         values: Any = self.critic.apply(critic, jnp.concatenate([obs, action]))
         return values[0]
 
     def smoothed_target_action(self, state: TD3State, obs: Array, noise: LearningNoise) -> Array:
-        r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, as allowed.
+        r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, restricted.
 
         Source: Fujimoto et al. (2018), eq. 14.
         """
@@ -248,7 +248,7 @@ class TD3(ActorCritic):
         action = self.action(outputs, noise.target_policy, state)
         return self.restrict(action + self.max_action * smoothing)
 
-    # What discrete actions differ in.
+    # Methods that discrete actions override.
 
     def draw(self, key: Array, shape: tuple[int, ...]) -> Array | None:
         """The randomness of `action`."""
@@ -259,7 +259,7 @@ class TD3(ActorCritic):
         return self.best(outputs)
 
     def restrict(self, action: Array) -> Array:
-        """An action as it is allowed to be once Gaussian noise was added."""
+        """Makes an action with Gaussian noise an allowed one."""
         return jnp.clip(action, -self.max_action, self.max_action)
 
     def warm_up(self, key: Array) -> Array:
@@ -273,7 +273,7 @@ class TD3(ActorCritic):
 
 
 class DiscreteTD3(TD3):
-    """The agent for discrete actions as relaxed one-hot vectors; noise may lead anywhere."""
+    """The agent for discrete actions as relaxed one-hot vectors; noise is not restricted."""
 
     config: DiscreteTD3Config
 
@@ -326,7 +326,7 @@ def gumbel_softmax(
 def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
-    It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
+    It falls linearly from `hparams.temperature` to `hparams.final_temperature` times that, in
     `num_steps` learning steps, and stays there.
 
     Source: `docs/reference.md` 4.4.

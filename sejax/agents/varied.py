@@ -1,9 +1,9 @@
 """Agents whose learning rate, batch size, hidden size and depth are drawn anew for each training.
 
-All of them are one program. Learning rate and batch size are traced numbers; a hidden size is that
-of a network in which the other units are switched off (`networks.narrow`), in the smallest of a few
-networks that has room; for each of these, and for each depth, there is a branch. A branch is a real
-one where agents train one after another (`num_parallel=1`); under `vmap` all of them would run.
+One program holds all of them. Learning rate and batch size are traced numbers. For each depth there
+are networks of a few sizes, and each network has a branch. A training takes the smallest network
+with room for its hidden size; the other units are switched off (`networks.narrow`). If agents train
+one after another (`num_parallel=1`), only one branch runs; under `vmap` all branches would run.
 
 Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hyperparameters";
 `docs/reference.md` 4.9.
@@ -33,25 +33,25 @@ class Range(NamedTuple):
 
 
 def ranges_of(config: AgentConfig) -> dict[str, Range]:
-    """The ranges around an agent's configuration, of the options that say how they are drawn.
+    """The ranges from which options are drawn, around an agent's configuration.
 
-    Those of `option(..., varied=how)`:
+    An option with `option(..., varied=how)` is drawn:
 
     - `triple`: a third to three times the value, log-uniformly.
     - `one_more_or_less`: from one less, at least 1, to one more.
     - `tenth_to_one`: in [0.1, 1].
 
     Raises:
-      ConfigError: if no option says so.
+      ConfigError: if no option has `varied` set.
 
     Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
     cls, hints = type(config), get_type_hints(type(config))
     names = [field.name for field in dataclasses.fields(config)]
     how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
-    must = f"must be default with {cls.__name__}, none of whose options has `varied` set"
+    must = f"must be default with {cls.__name__}, as none of its options has `varied` set"
     require(how, "agent_hparams", f"{must}; got varied. Set agent_hparams=default.")
-    # Traced ones first: the order says which key draws what.
+    # Traced options first: the order decides which key draws which option.
     ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])
     return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
 
@@ -69,7 +69,7 @@ def _range(how: str, value: float, integer: bool) -> Range:
 
 
 def draw_value(key: Array, bounds: Range) -> Array:
-    """One value, `[]` float32; integers are uniform over themselves, or log-uniform and rounded."""
+    """One value, `[]` float32. Integers are drawn uniformly, or log-uniformly and rounded."""
     low, high = (bounds.low - 0.5, bounds.high + 0.5) if bounds.integer else bounds[:2]
     if bounds.log:
         value = jnp.exp(jax.random.uniform(key, minval=math.log(low), maxval=math.log(high)))
@@ -81,7 +81,7 @@ def draw_value(key: Array, bounds: Range) -> Array:
 
 
 def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
-    """Sizes of networks, evenly spaced, the last of which has room for all in the range."""
+    """Evenly spaced sizes of networks; the last network has room for all sizes in the range."""
     parts = cpu.NUM_SIZES if num_layers == 1 else cpu.NUM_SIZES_DEEP
     step = cpu.whole_vectors(-(-math.ceil(bounds.high) // parts))
     smallest = math.ceil(bounds.low / step) * step
@@ -92,14 +92,14 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     """An agent whose options are drawn anew for each training; see `Agent.fresh`.
 
     Args:
-      config: of the agent around which they are drawn.
-      make: builds the agent that a configuration like it describes.
+      config: configuration around which options are drawn.
+      make: builds an agent from such a configuration.
 
     Returns:
-      The agent that `config` describes, with variants that have room for all that may be drawn.
+      The agent that `config` describes, with variants that have room for all possible values.
 
     Raises:
-      ConfigError: if none of its options says how it is drawn.
+      ConfigError: if no option has `varied` set.
     """
     ranges = ranges_of(config)
     shapes: list[tuple[int, int]] = []  # (depth, room for hidden units) of each variant, ascending
