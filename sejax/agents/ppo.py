@@ -296,7 +296,7 @@ class PPO(Learner):
     def prepared(
         self, state: PPOState, steps: Transition, ended: Steps
     ) -> tuple[Batch, Float[Array, "3"]]:
-        r"""A rollout, evaluated by the parameters that made it, and the sums over all returns so far.
+        r"""A rollout, evaluated by the parameters that made it, and sums over all returns so far.
 
         With `advantages="monte_carlo"` returns are normalised. The advantage is the return minus
         the critic's value in each Adam step (`docs/reference.md` 4.5). Nothing is bootstrapped: an

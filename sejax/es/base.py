@@ -23,11 +23,11 @@ StrategyState: TypeAlias = PyTree  # only the strategy reads it
 
 
 class Groups(NamedTuple, Generic[T]):
-    """What belongs to the two groups of trainings in a generation.
+    """Values for the two groups of trainings in a generation.
 
     Attributes:
-      population: of each candidate's evaluations; arrays are `[pop, evaluation, ...]`.
-      incumbent: of the incumbent's evaluations, in each turn one with each agent of a mixture;
+      population: for the candidates' evaluations; arrays are `[pop, evaluation, ...]`.
+      incumbent: for the incumbent's evaluations; each turn has one with each agent of a mixture;
         arrays are `[turn, agent, ...]`.
     """
 
@@ -41,7 +41,7 @@ class Evaluations:
 
     Attributes:
       num_evals: evaluations for each candidate of the population.
-      aggregate: what a candidate's score is, given those of its evaluations: mean or min.
+      aggregate: how the scores of a candidate's evaluations become one score: mean or min.
       num_incumbent_evals: evaluations of the incumbent.
       common_random_numbers: whether the r-th evaluation of every candidate has the same seed.
     """
@@ -72,7 +72,7 @@ class Evaluations:
         )
 
     def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
-        """A score for each candidate; not finite if that of an evaluation is not."""
+        """A score for each candidate; not finite if the score of one evaluation is not finite."""
         scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 
@@ -82,7 +82,7 @@ class Evaluations:
         """The incumbent's scores, with agents that diverged ranked last, and their mean.
 
         Agents that diverged get the lowest finite score of the generation: a mean without them
-        would rank an incumbent by the agents that survived it. If none survived, the mean is nan.
+        would rank an incumbent by its other agents alone. If all diverged, the mean is nan.
         """
         all_scores = jnp.concatenate([population, scores])
         lowest = jnp.nanmin(jnp.where(jnp.isfinite(all_scores), all_scores, jnp.nan))
@@ -99,12 +99,12 @@ class Strategy:
       init: `(key, mean [dims]) -> state`.
       ask: `(key, state) -> (population [pop, dims], state)`.
       tell: `(key, population, scores [pop], incumbent_score [], state) -> state`; higher scores are
-        better, and those that are not finite rank worst.
+        better, and scores that are not finite rank worst.
       incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
       population_size: vectors that `ask` returns.
-      antithetic: whether the second half of the population is the first mirrored at the incumbent.
-      remembers_scores: whether scores are compared with those of earlier generations, so that they
-        must be in one unit.
+      antithetic: whether the second half of the population mirrors the first at the incumbent.
+      remembers_scores: whether it compares scores across generations, which then must have one
+        unit.
       evaluations: how often each candidate is evaluated.
     """
 
@@ -131,7 +131,7 @@ class StrategyOptions(Options):
     Attributes:
       population_size: n_p: perturbations in a generation
       num_evals: agents on each candidate
-      eval_aggregate: how their scores become one
+      eval_aggregate: how the scores of a candidate's agents become one
       common_random_numbers: the same inner seeds for all candidates of a generation
     """
 

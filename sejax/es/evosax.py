@@ -1,6 +1,6 @@
-"""evosax's distribution-based algorithms in the place of NES.
+"""evosax's distribution-based algorithms in place of NES.
 
-This is the one place where a sign is turned: evosax minimises a fitness, scores are maximised.
+Only this module turns a sign: evosax minimises a fitness, and sejax maximises scores.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
 
 
-# Name of the class; whether the second half of its candidates is the first mirrored; the optimizer
-# of its mean, "adam" or "sgd" (for steps that have a natural scale), None if it takes none.
+# Name of the class; whether the second half of its candidates mirrors the first; the optimizer of
+# its mean: "adam", "sgd" (if its steps have a natural scale), or None if it takes no optimizer.
 ALGORITHMS = {
     "cma_es": ("CMA_ES", False, None),
     "cr_fm_nes": ("CR_FM_NES", True, None),
@@ -42,14 +42,14 @@ ALGORITHMS = {
 class EvosaxConfig(StrategyOptions):
     """One of evosax's distribution-based algorithms, with our std and step size.
 
-    They are set explicitly because evosax's defaults (std 1, learning rate 1e-3) either destroy a
-    small network or hardly move it. For another algorithm of evosax see `from_evosax`.
+    Std and step size are set explicitly, because evosax's defaults (std 1, learning rate 1e-3)
+    either destroy a small network or hardly move it. For other algorithms see `from_evosax`.
 
     Attributes:
       num_incumbent_evals: Agents trained on the distribution's mean.
       noise_std: Initial std of the search distribution.
-      noise_std_decay: Factor for each generation, of open_es alone.
-      step_size: Learning rate of Adam on the mean, of open_es and pgpe.
+      noise_std_decay: Factor on the std after each generation, for open_es only.
+      step_size: Learning rate of Adam on the mean, for open_es and pgpe only.
     """
 
     name: str = "open_es"
@@ -75,7 +75,7 @@ class EvosaxConfig(StrategyOptions):
             adam = optax.adam(self.step_size)
             options["optimizer"] = adam if optimizer == "adam" else optax.sgd(1.0)
         if self.name == "open_es":
-            # evosax asks for the next generation's std with the number of the one before.
+            # evosax computes the next generation's std from the number of the current generation.
             std, decay = self.noise_std, self.noise_std_decay
             options["std_schedule"] = optax.exponential_decay(std * decay, 1, decay)
         algorithm = distribution_based_algorithms[cls](
@@ -91,9 +91,9 @@ class EvosaxConfig(StrategyOptions):
 
         def init(key: Array, mean: Float[Array, " dims"]) -> StrategyState:
             state = strategy.init(key, mean)
-            if self.name == "open_es":  # which begins with the second generation's std
+            if self.name == "open_es":  # evosax begins with the second generation's std
                 return state.replace(std=state.std / self.noise_std_decay)
-            return state.replace(B=state.B / self.noise_std)  # std_init stands in it as well
+            return state.replace(B=state.B / self.noise_std)  # evosax puts std_init into B as well
 
         return dataclasses.replace(strategy, init=init)
 
@@ -106,13 +106,13 @@ def from_evosax(
     remembers_scores: bool = False,
     evaluations: Evaluations = Evaluations(),
 ) -> Strategy:
-    """A strategy of an algorithm of evosax, whose mean is the incumbent.
+    """A strategy from an algorithm of evosax. The algorithm's mean is the incumbent.
 
     Args:
       algorithm: a distribution-based algorithm for vectors `[num_dims]`.
       params: of the algorithm; its `default_params` if not given.
-      antithetic: whether the second half of its candidates is the first mirrored at the mean.
-      remembers_scores: whether it compares scores with those of earlier generations.
+      antithetic: whether the second half of its candidates mirrors the first at the mean.
+      remembers_scores: whether it compares scores across generations.
       evaluations: how often each candidate is evaluated.
 
     Example:
@@ -128,8 +128,8 @@ def from_evosax(
     def tell(
         key: Array, population: Array, scores: Array, incumbent_score: Array, state: StrategyState
     ) -> StrategyState:
-        # An infinity would poison the algorithms that standardise: what is not finite is worse than
-        # the worst by the gap between best and worst, or by 1.
+        # An infinity would poison algorithms that standardise. So a score that is not finite
+        # becomes worse than the worst, by the gap between best and worst, and by 1 at least.
         finite, fitness = jnp.isfinite(scores), -scores
         worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
         best = jnp.min(jnp.where(finite, fitness, jnp.inf))

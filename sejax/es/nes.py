@@ -22,8 +22,7 @@ from sejax.options import Count, Decay, Fraction, option
 class NESConfig(StrategyOptions):
     """NES with mirrored sampling and evaluation of the search mean (Algorithm 1).
 
-    The defaults are what was measured to work for SEs (docs/defaults.md); `preset=paper` has the
-    paper's.
+    The defaults were measured to work for SEs (docs/defaults.md); `preset=paper` has the paper's.
 
     Attributes:
       population_size: n_p: perturbations of a generation
@@ -34,10 +33,9 @@ class NESConfig(StrategyOptions):
       step_size: alpha: step size of the update
       step_size_decay: factor on alpha after each generation
       mirrored: each perturbation is tried as +eps and -eps and keeps its better sign
-      score_transform: A name, or my_module:my_function of scores `[pop]` that gives weights
-        `[pop]`.
-      update_rule: authors: psi += alpha sum F eps; paper: that divided by n_p sigma
-      weight_decay: psi shrinks by this before each update
+      score_transform: A name, or my_module:my_function that maps scores `[pop]` to weights `[pop]`.
+      update_rule: authors: psi += alpha sum F eps; paper: the same sum divided by n_p sigma
+      weight_decay: psi shrinks by this fraction before each update
     """
 
     population_size: PopulationSize = 64
@@ -58,9 +56,9 @@ class NESConfig(StrategyOptions):
     def make(self, num_dims: int) -> Strategy:
         r"""NES over vectors `[num_dims]`.
 
-        The population is psi + eps_i for each of `population_size`, then psi - eps_i if sampling is
-        mirrored. A mirrored pair's score is that of its better sign, and its eps has that sign; a
-        tie keeps the plus.
+        The population is psi + eps_i for `population_size` perturbations, then psi - eps_i if
+        sampling is mirrored. A mirrored pair takes the score and the eps of its better sign; in a
+        tie, of the plus sign.
 
         .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
 

@@ -1,9 +1,8 @@
 r"""Score transforms: from the candidates' scores K_i to their weights F_i; eight, or your own.
 
-Scores are to be maximised. A score that is not finite ranks below every finite one and gets the
-weight of the worst. If no candidate is better than another (or than the incumbent, where the
-transform compares with it), all weights of a transform that needs a difference are 0 and the proxy
-stays.
+Scores are maximised. A score that is not finite ranks below every finite one and gets the weight of
+the worst. Some transforms need a difference between candidates, or between a candidate and the
+incumbent. Without a difference their weights are all 0 and the proxy stays.
 
 Source: paper, appendix "NES Score Transformation". `K_psi` is the incumbent's mean score.
 """
@@ -55,8 +54,8 @@ def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
         \hat F_i = \frac{\max(0, \log(n_p/2 + 1) - \log R_i)}{\sum_j \max(0, \ldots)} - 1/n_p,
         \quad F_i = \hat F_i / \max_i |\hat F_i|
 
-    Here :math:`R_i` is 1 for the best, as in the source; the paper's text defines it with 0 for
-    the worst, for which the logarithm is not defined. Ties share the better rank.
+    Here :math:`R_i` is 1 for the best, as in the source. In the paper's text it is 0 for the worst,
+    for which the logarithm is not defined. Ties share the better rank.
     """
     return _scaled_utilities(scores, 1 / scores.shape[0])
 
@@ -79,7 +78,7 @@ def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 
 def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    r"""Weighs the candidates that beat the incumbent by how much, the best with 1.
+    r"""Weighs the candidates by how far they beat the incumbent. The best has weight 1.
 
     .. math:: F_i = \max(0, K_i - K_\psi) / (\max K - K_\psi)
     """
@@ -99,7 +98,7 @@ TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY
 
 
 def require_transform(choice: str | OwnTransform) -> None:
-    """Checks that it is a name, a `module:attribute` that may be imported, or a function.
+    """Checks that a choice is a name, a `module:attribute` that may be imported, or a function.
 
     Raises:
       ConfigError: for anything else. Nothing is imported.
@@ -114,14 +113,14 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
     """The transform that a configuration chooses.
 
     Args:
-      choice: a name of `TRANSFORMS`; or a function of one's own, itself or as `module:attribute`.
-        It maps scores `[pop]` to weights `[pop]`. For a score that is not finite it is given the
-        worst finite one; a weight that is not finite is 0.
+      choice: a name of `TRANSFORMS`; or your own function, as an object or as `module:attribute`.
+        It maps scores `[pop]` to weights `[pop]`. It gets the worst finite score in place of scores
+        that are not finite. Its weights that are not finite become 0.
       pop: the number of scores.
 
     Raises:
-      ConfigError: if a function cannot be imported or traced, or gives weights of another shape, or
-        some that are not finite for the scores 0, 1, 2, ... or for equal ones.
+      ConfigError: if a function cannot be imported or traced; or if its weights for the scores 0,
+        1, 2, ... or for equal scores have another shape or are not finite.
     """
     if isinstance(choice, str) and choice in TRANSFORMS:
         return TRANSFORMS[choice]
@@ -146,7 +145,7 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
 
 
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    """Advantage over the incumbent, 0 for candidates that are not better by more than rounding.
+    """Advantage over the incumbent; 0 for candidates that are worse, or better by rounding alone.
 
     Every candidate with a finite score is better than an incumbent without one.
     """
@@ -160,7 +159,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 def _scaled_utilities(scores: Scores, subtracted: float) -> Scores:
     """Log utilities less a constant, with a largest magnitude of 1; 0 if all scores are equal.
 
-    They sum to 1 before, and are 0 for a score that is not finite, whatever its rank.
+    Before the subtraction they sum to 1, and a score that is not finite has 0, whatever its rank.
     """
     ranked = or_minus_inf(scores)
     best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)

@@ -1,6 +1,6 @@
 """Safetensors files with a checksum, so that a change of any bit is noticed.
 
-The metadata has one entry, a JSON object. Its `sha256` is the digest of the whole file as it is
+The metadata has one entry, a JSON object. Its `sha256` is the digest of the whole file, computed
 with 64 zeros in the digest's place.
 """
 
@@ -67,11 +67,11 @@ def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """As `unpack`, of a file.
 
     Raises:
-      DamagedError: as `unpack`; for a file that is longer than its header says without reading it.
+      DamagedError: as `unpack`. A file whose size does not fit its header is not read.
       OSError: if it cannot be read.
     """
     try:
-        with path.open("rb"), safe_open(path, "np"):  # which has no OSError for a folder
+        with path.open("rb"), safe_open(path, "np"):  # safe_open raises no OSError for a folder
             pass
     except SafetensorError as error:
         raise DamagedError("it has no header that fits its size") from error

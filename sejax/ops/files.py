@@ -12,11 +12,11 @@ from sejax.options import ConfigError, shortened
 
 
 def cache_folder() -> Path | None:
-    """The folder for what sejax can make again; need not exist.
+    """The folder for files that sejax can make again. It need not exist.
 
     Returns:
-      `SEJAX_CACHE_DIR`, else `sejax` in the user's folder for caches (`XDG_CACHE_HOME`, which is
-      `~/.cache` if it is not set). None if `SEJAX_CACHE_DIR` is set to nothing, or nobody's home.
+      `SEJAX_CACHE_DIR`, else `sejax` in the user's folder for caches (`XDG_CACHE_HOME`, by default
+      `~/.cache`). None if `SEJAX_CACHE_DIR` is set to nothing, or if no home folder is found.
     """
     default = os.path.join(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "sejax")
     path = os.path.expanduser(os.environ.get("SEJAX_CACHE_DIR", default))
@@ -24,10 +24,10 @@ def cache_folder() -> Path | None:
 
 
 def require_writable(field: str, folder: Path) -> None:
-    """Checks that files can be written in a folder, which may be new; leaves nothing there.
+    """Checks that files can be written in a folder, which may be new. Leaves nothing there.
 
     Raises:
-      ConfigError: of this field, if they cannot.
+      ConfigError: for this field, if files cannot be written.
     """
     new_folders = missing(folder)
     try:
@@ -41,12 +41,12 @@ def require_writable(field: str, folder: Path) -> None:
 
 
 def missing(folder: Path) -> list[Path]:
-    """A folder and those above it that are not there, the innermost first."""
+    """A folder and its parents, as far as they do not exist; the innermost first."""
     return [path for path in (folder, *folder.parents) if not os.path.exists(path)]
 
 
 def remove_empty(folders: Iterable[Path]) -> None:
-    """Removes those of the folders that are empty."""
+    """Removes the empty folders among these."""
     for folder in folders:
         with contextlib.suppress(OSError):  # it is not empty
             folder.rmdir()
@@ -54,16 +54,16 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path` that takes its place when the block succeeds.
+    """Yields a temporary path beside `path`. Its file replaces `path` when the block succeeds.
 
-    The content is on the disk before the file takes its place. A power cut may forget that it did:
-    the file before is then there, whole. A kill leaves the temporary; see `remove_leftovers`.
+    The content is on the disk before the file is replaced. A power cut may undo the replacement:
+    the older file is then there, whole. A kill leaves the temporary file; see `remove_leftovers`.
 
     Raises:
       OSError: if the folder cannot be written or the disk is full; `path` is then as it was.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # It keeps the ending, as some writers choose the format by it.
+    # It keeps the ending: some writers choose the format by the ending.
     temporary = path.with_name(f".{path.name}.sejax-{secrets.token_hex(4)}{path.suffix}")
     try:
         yield temporary
@@ -86,11 +86,11 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def remove_leftovers(folder: Path, names: Iterable[str]) -> None:
-    """Removes the temporaries of `atomic_path` that killed processes left.
+    """Removes the temporary files of `atomic_path` that killed processes left.
 
     Args:
-      folder: must be in use by this process alone, as far as these files go.
-      names: of the files whose temporaries are removed.
+      folder: the folder; no other process may be writing these files.
+      names: names of the files whose temporary files are removed.
     """
     for name in names:
         for path in folder.glob(f".{name}.sejax-{'[0-9a-f]' * 8}{Path(name).suffix}"):
@@ -99,7 +99,7 @@ def remove_leftovers(folder: Path, names: Iterable[str]) -> None:
 
 
 def as_file_name(text: str) -> str:
-    """The text, with each run of characters that file names had better not have as an underscore.
+    """The text, with an underscore for each run of characters that are unsafe in file names.
 
     Example:
       >>> as_file_name("env=mine:Task,seed=1")

@@ -1,9 +1,9 @@
 """Random keys for each step of a loop, by a hash.
 
 `jax.random.fold_in` and `split` run threefry, 20 rounds for each two words. A step needs less:
-words that no other step and no other purpose shares. They are the finaliser of a well-mixing 32-bit
-hash over the loop's key, the step and the purpose, and serve `jax.random` as keys like any others.
-The whole training of a small DDQN takes 0.94 of the time.
+words that no other step and no other purpose shares. Here the finaliser of a well-mixing 32-bit
+hash makes them from the loop's key, the step and the purpose. `jax.random` takes them like any
+other keys. The whole training of a small DDQN takes 0.94 of the time.
 """
 
 import jax
@@ -16,7 +16,7 @@ _WEYL = 0x9E3779B9  # 2**32 / golden ratio, odd: its multiples are spread evenly
 def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
     """`num` independent keys for one step of a loop.
 
-    Plain form, with other random numbers (`tests/test_keys.py` has the statistics of these)::
+    Plain form, with other random numbers (`tests/test_keys.py` tests the statistics of the keys)::
 
         tuple(jax.random.split(jax.random.fold_in(key, step), num))
 
@@ -26,9 +26,8 @@ def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
       num: how many (static).
 
     Returns:
-      Keys of the same implementation, whose data are random bits themselves. For threefry, with
-      its two words, two keys of a loop coincide by chance alone, with probability 2**-64 for a
-      pair.
+      Keys of the same implementation; their data are random bits. A threefry key has two words:
+      two keys of a loop are equal by chance alone, with probability 2**-64 for a pair.
 
     Example:
       >>> a, b = step_keys(jax.random.key(0), jnp.int32(7), 2)

@@ -16,8 +16,8 @@ from jaxtyping import PyTree
 
 Body = Callable[..., tuple[PyTree, PyTree]]
 
-# On a GPU the host waits for a loop's predicate, which it asks for once in so many steps. What a
-# batch that has ended meanwhile does changes nothing.
+# On a GPU the host waits for a loop's predicate, so it is checked once in this many steps. If the
+# batch has ended before the check, the steps until then change nothing.
 STEPS_PER_CHECK = 16
 
 
@@ -35,19 +35,20 @@ def while_any_active(
     its `small` by a select, and its body drops the writes to `large`.
 
     Args:
-      body: one iteration of one element. Its last argument is a Python bool: if it is set, the
-        element may have stopped, and then the body must leave `large` as it is, without a select.
+      body: one iteration of one element. Its last argument is a Python bool. If it is set, the
+        element may have stopped; for a stopped one the body must leave `large` as it is, without a
+        select.
       large: pytree of arrays that must be updated in place, such as a replay buffer.
       small: dataclass pytree with a bool scalar `active`; cheap to select over.
       consts: pytree that the body only reads.
-      per_check: iterations between two looks at the predicate, where a host waits for it.
+      per_check: iterations between two checks of the predicate, where a host waits for it.
 
     Returns:
       The last `large` and `small`.
 
     Example:
-      Two loops write 1, 2, ... into a log, three numbers and one. `masked`, the body writes beyond
-      the end of the log where the loop has stopped, which changes nothing.
+      One loop writes three numbers 1, 2, 3 into a log, another loop one. If `masked`, a stopped
+      loop's body writes beyond the end of the log, which changes nothing.
 
       >>> from flax import struct
       >>> @struct.dataclass
@@ -70,7 +71,7 @@ def while_any_active(
 def _while_any_active(
     body: Body, depth: int, per_check: int, large: PyTree, small: PyTree, consts: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """The loop under `depth` vmaps, which makes itself one deeper when it is vmapped."""
+    """The loop under `depth` vmaps. When it is vmapped, it makes the loop one vmap deeper."""
 
     def masked_step(large: PyTree, small: PyTree, consts: PyTree) -> tuple[PyTree, PyTree]:
         def step(*args: PyTree) -> tuple[PyTree, PyTree]:
@@ -83,8 +84,8 @@ def _while_any_active(
             stepped = jax.tree.map(functools.partial(_select, small.active), stepped, small)
         return large, stepped
 
-    # Arrays that the body closes over (a map of a grid world) become arguments of the loop: within
-    # a `cond` whose predicate is vmapped they are batched, which custom_vmap refuses for closures.
+    # Arrays that the body closes over (a grid world's map) become arguments of the loop. Inside a
+    # `cond` with a vmapped predicate they are batched, and custom_vmap refuses batched closures.
     jaxpr, shapes = jax.make_jaxpr(masked_step, return_shape=True)(large, small, consts)
     out_tree = jax.tree.structure(shapes)
 
@@ -101,7 +102,7 @@ def _while_any_active(
             return jax.lax.fori_loop(0, per_check, lambda _, each: step(each), carry)
 
         def advance(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-            if depth == 0:  # a step of a loop that has ended is not masked
+            if depth == 0:  # no block: its steps after the loop's end would not be masked
                 return step(carry)
             return jax.lax.platform_dependent(carry, cpu=step, default=block)
 
@@ -112,7 +113,7 @@ def _while_any_active(
         def broadcast(batched: bool, x: PyTree) -> PyTree:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
-        # The deeper loop captures for itself what is the same for all elements.
+        # The deeper loop captures anew what is the same for all elements.
         out = _while_any_active(
             body, depth + 1, per_check, *jax.tree.map(broadcast, in_batched[:3], list(args[:3]))
         )

@@ -4,7 +4,7 @@ import jax
 
 from sejax.options import as_text, require
 
-# Values that each may have, and why no others.
+# For each mode: the allowed values, and why there are no others.
 MODES: dict[str, tuple[tuple[object, ...], str]] = {
     "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
     "jax_debug_nans": (
@@ -24,7 +24,7 @@ def require_modes() -> None:
     """Checks that jax is in no mode in which programs of sejax fail.
 
     Raises:
-      ConfigError: of the mode, such as `jax_enable_x64`.
+      ConfigError: for the mode, such as `jax_enable_x64`.
     """
     for mode, (allowed, reason) in MODES.items():
         got = getattr(jax.config, mode)

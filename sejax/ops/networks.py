@@ -18,15 +18,15 @@ PRELU_SLOPE = 0.25
 def _rational_tanh(
     numerator: tuple[float, ...], denominator: tuple[float, ...], cut: float
 ) -> Callable[[Array], Array]:
-    """An odd rational function in the place of tanh, whose input is clipped to +-`cut`.
+    """An odd rational function in place of tanh; its input is clipped to +-`cut`.
 
-    Plain form: `jnp.tanh`, equal up to the error below (`tests/test_networks.py`). XLA's has degree
-    13 over 6, and selects for small and for large inputs.
+    Plain form: `jnp.tanh`, equal up to the error below (`tests/test_networks.py`). XLA's tanh has
+    degree 13 over 6, and selects for small and for large inputs.
 
     Args:
       numerator: coefficients of x times powers of x^2, the lowest first.
-      denominator: of powers of x^2.
-      cut: beyond it the function is constant.
+      denominator: coefficients of powers of x^2.
+      cut: the function is constant beyond it.
     """
 
     @jax.custom_jvp
@@ -45,18 +45,18 @@ def _rational_tanh(
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array | float:
-    """Its value, by Horner's scheme; the coefficient of the lowest power comes first."""
+    """A polynomial by Horner's scheme; the coefficient of the lowest power comes first."""
     value: Array | float = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         value = value * x + coefficient
     return value
 
 
-# Coefficients: of all functions of the form and with slope 1 at 0 the nearest to tanh up to the
-# cut, by linear programs; of `fast_tanh` with no value above 1, bisecting the error. Both increase
-# but for rounding, and stay within [-1, 1].
+# Coefficients: linear programs found the function nearest to tanh up to the cut, of this form and
+# with slope 1 at 0. For `fast_tanh` no value may exceed 1; the error was bisected. Both functions
+# increase, but for rounding, and stay within [-1, 1].
 #
-# Exact to rounding: off by at most 3.3e-7, 6 units in the last place, as XLA's is by 2.7e-7 and 5.
+# Exact to rounding: off by at most 3.3e-7, 6 units in the last place (XLA's tanh: 2.7e-7 and 5).
 # A hidden layer of `preset=paper`'s DDQN takes 0.78 of the time with it, a learning step 0.90.
 tanh = _rational_tanh(
     (1.0, 0.134394869, 3.56568652e-3, 2.17972718e-5, 1.50901975e-8),
@@ -99,10 +99,10 @@ class Dense(nn.Module):
         return affine(kernel, bias, x)
 
 
-# A product over at most this many terms is written out as a sum, which XLA fuses with what
-# surrounds it; calling the matrix library for it costs more than the arithmetic.
+# A product over at most this many terms is written out as a sum. XLA fuses it with the operations
+# around it; a call of the matrix library would cost more than the arithmetic.
 _MAX_UNROLLED = 8
-_WIDE = 64  # units from which on a kernel is read row by row
+_WIDE = 64  # a kernel with at least so many units is read row by row
 
 
 @jax.custom_vjp
@@ -126,8 +126,8 @@ def _affine_backward(residuals: tuple[Array, Array], gradient: Array) -> tuple[A
     kernel, x = residuals
     num_outputs = kernel.shape[0]
     if num_outputs <= _MAX_UNROLLED:
-        # The result of a product is stored, whereas XLA would compute a gradient that comes out of
-        # a chain of cheap operations anew for each of the `in` rows that the last line makes.
+        # The result of a product is stored. Without one XLA would compute the gradient, a chain of
+        # cheap operations, anew for each of the `in` rows of the last line.
         gradient = jnp.eye(num_outputs) @ gradient
     # Summed as a product: XLA's row sums take several times as long.
     bias_gradient = gradient @ jnp.ones(gradient.shape[1])
@@ -140,10 +140,10 @@ affine.defvjp(_affine_forward, _affine_backward)
 def _transposed_product(
     kernel: Float[Array, "out in"], gradient: Float[Array, "out batch"]
 ) -> Float[Array, "in batch"]:
-    """`kernel.T @ gradient`, which the matrix library reads row by row.
+    """`kernel.T @ gradient`; the matrix library reads a wide kernel row by row.
 
-    Plain form: `kernel.T @ gradient`. Where the kernel is wide the library does that at 0.4 of the
-    speed of a product without transposition; barriers keep XLA from undoing the rewriting.
+    Plain form: `kernel.T @ gradient`. With a wide kernel the library computes the plain form at 0.4
+    of the speed of a product without transposition. Barriers keep XLA from restoring that form.
     """
     (num_outputs, num_inputs), batch = kernel.shape, gradient.shape[1]
     if min(num_outputs, num_inputs) < _WIDE or batch >= 2 * num_outputs:
@@ -168,7 +168,7 @@ class MLP(nn.Module):
     (proxies: the authors' NES perturbs the weights and biases of linear layers only). `layer_norm`
     normalises each column over the units of every hidden layer but the first, before the
     activation; its scale and bias are learned and, as in the authors' code, the same in all layers.
-    It knows how many units `narrow` has left.
+    The norm covers only the units that `narrow` has left.
 
     Source: paper, appendix "SE hyperparameters"; `docs/reference.md` 1.10 and 1.11.
     """
@@ -197,7 +197,7 @@ class MLP(nn.Module):
         normalize = nn.LayerNorm(
             epsilon=1e-5, reduction_axes=0, feature_axes=0, use_fast_variance=False
         )
-        # A parameter that never changes: rounded, as averaging it into a target network may not.
+        # A parameter that never changes. Rounded: averages in a target network may not be whole.
         width = self.param("width", nn.initializers.constant(self.hidden_size), ())
         in_use = jnp.arange(self.hidden_size) < jnp.round(jax.lax.stop_gradient(width))
 
@@ -221,7 +221,7 @@ class MLP(nn.Module):
 def init_narrowed(
     network: nn.Module, key: Array, num_inputs: int, hidden_size: Array | None = None
 ) -> PyTree:
-    """Variables of a fresh network, of which `hidden_size` hidden units count; None for all."""
+    """Variables of a fresh network with `hidden_size` hidden units in use; None for all."""
     params = network.init(key, jnp.zeros(num_inputs))["params"]
     return {"params": params if hidden_size is None else narrow(params, hidden_size)}
 
@@ -229,9 +229,9 @@ def init_narrowed(
 def narrow(params: dict[str, PyTree], hidden_size: Array) -> dict[str, PyTree]:
     """Freshly initialised parameters of an `MLP` in which only the first `hidden_size` units count.
 
-    All weights into and out of the other units are 0. They stay 0 in training, as every activation
-    maps 0 to 0 with a finite slope, so that the network is exactly one with `hidden_size` units,
-    and its weights are distributed as those of a network that was made so.
+    All weights into and out of the other units are 0. They stay 0 in training, because every
+    activation maps 0 to 0 with a finite slope. So the network equals one with `hidden_size` units,
+    and its weights are distributed as in a fresh network of that size.
 
     Args:
       params: of an `MLP`; or of a `DuelingMLP`, whose shared part is narrowed.
@@ -261,12 +261,12 @@ class DuelingMLP(nn.Module):
 
     .. math:: Q(s, a) = V(s) + A(s, a) - \frac{1}{|A|} \sum_{a'} A(s, a')
 
-    The shared part is an `MLP` whose linear head has `feature_dim` outputs and no activation, and
-    each stream is an `MLP` on those with `stream_num_layers` hidden layers of `stream_hidden_size`
-    units. PReLU has a learned slope for each of the three parts.
+    The shared part is an `MLP`; its linear head has `feature_dim` outputs and no activation. Each
+    stream is an `MLP` on these outputs, with `stream_num_layers` hidden layers of
+    `stream_hidden_size` units. PReLU has a learned slope for each of the three parts.
 
-    Differs: the mean is over the actions of each sample. The authors' is over those of the whole
-    batch, so that the Q values of a sample depend on what else is in its batch.
+    Differs: the mean is over the actions of each sample. The authors take it over the actions of
+    the whole batch, so that a sample's Q values depend on the other samples of its batch.
 
     Source: Wang et al., "Dueling Network Architectures for Deep RL" (2016), eq. 9; paper, appendix,
     tables of DDQN and Dueling DDQN; `docs/reference.md` 4.2.

@@ -1,7 +1,7 @@
 """Optimizers whose numbers do not depend on the program around them.
 
-XLA makes the division of an array by a number a product in one program and leaves it in another, so
-that an agent would learn other weights on two devices than on one (a slow test of
+XLA turns the division of an array by a number into a product in some programs, and not in others.
+So an agent would learn other weights on two devices than on one (a slow test of
 `tests/test_run.py`). Here numbers are inverted first. The plain forms are optax's.
 """
 
@@ -41,9 +41,9 @@ def scale_by_adam(eps: float = 1e-8) -> optax.GradientTransformation:
 
 
 def clip_by_global_norm(max_norm: float) -> optax.GradientTransformation:
-    """The gradient, no longer than `max_norm`.
+    """Scales a gradient longer than `max_norm` down to this norm.
 
-    Plain form: `optax.clip_by_global_norm(max_norm)`, which sums the squares of each array apart:
+    Plain form: `optax.clip_by_global_norm(max_norm)`. It sums the squares of each array separately:
     eleven kernels more on a GPU for PPO's two networks.
     """
 

@@ -25,9 +25,9 @@ T = TypeVar("T")
 def compiler_options() -> dict[str, int] | None:
     """XLA's options for whole trainings; None for the defaults.
 
-    On a CPU, vectors of 512 bits, where the CPU has them; the default is 256. On an AMD EPYC a
-    generation takes 0.71 of the time with the paper's DDQN and 0.88 with the default one. Sums of
-    wider vectors round otherwise, so that numbers differ in their last bits.
+    On a CPU that has them, vectors of 512 bits; the default is 256. On an AMD EPYC a generation
+    takes 0.71 of the time with the paper's DDQN and 0.88 with the default one. Sums of wider
+    vectors round differently, so that numbers differ in their last bits.
     """
     options = {"xla_cpu_prefer_vector_width": 512}
     if jax.devices()[0].platform != "cpu":
@@ -52,13 +52,13 @@ def spread_over_devices(
       num_devices: None for all.
       num_parallel: elements in one vmapped batch of a device; a batch is filled up with copies.
         None for `cpu_num_parallel` on a CPU and for all elements elsewhere.
-      cpu_num_parallel: None for all elements; 1 where those of a batch would wait for each other.
+      cpu_num_parallel: None for all elements; 1 if elements of a batch would wait for each other.
 
     Returns:
-      A function of the arguments, with a leading axis each. Devices take the elements in turn (0,
+      A function of the arguments, each with a leading axis. Devices take the elements in turn (0,
       1, 0, 1, ...), so that each gets its share of long and short ones. The result does not depend
-      on the number of devices: to the bit where `num_parallel` is 1 or a power of two, up to
-      rounding otherwise, as elements that do not fill a CPU's vectors are not all computed alike.
+      on the number of devices: to the bit if `num_parallel` is 1 or a power of two, else up to
+      rounding, because a CPU computes elements that do not fill its vectors differently.
 
     Raises:
       ConfigError: if there are fewer than `num_devices` devices.
@@ -68,10 +68,10 @@ def spread_over_devices(
 
 
 def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
-    """The arrays of a pytree with a copy on each device, as results of spread functions have.
+    """A copy of a pytree's arrays on each device, in the form of spread functions' results.
 
-    A jitted loop is compiled anew if its state comes back from devices on which it did not start,
-    or strongly typed where it was weakly typed.
+    Without it a jitted loop is compiled twice: its state comes back from devices on which it did
+    not start, or is strongly typed where it was weakly typed.
     """
     tree = jax.tree.map(_strongly_typed, tree)
     mesh = _mesh(num_devices)
@@ -102,12 +102,12 @@ def spread_groups_over_devices(
 
     Args:
       fns: a function of one element of each group.
-      num_devices: as of `spread_over_devices`.
-      num_parallel: as of `spread_over_devices`.
-      cpu_num_parallel: as of `spread_over_devices`, for each group.
+      num_devices: as in `spread_over_devices`.
+      num_parallel: as in `spread_over_devices`.
+      cpu_num_parallel: as in `spread_over_devices`, for each group.
 
     Returns:
-      A function of the groups' arguments, a tuple each, with a leading axis over the elements.
+      A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
     available = jax.devices()
     require(
@@ -157,8 +157,8 @@ def map_in_batches(
         return jax.lax.map(lambda args: fn(*args), args)
     if width == size:
         return jax.vmap(fn)(*args)
-    # The last batch is filled up with copies: products of another width round otherwise, and a
-    # result must not depend on how many elements a device has.
+    # The last batch is filled up with copies: products of another width round differently, and a
+    # result must not depend on the number of elements on a device.
     num_batches = -(-size // width)
     indices = np.arange(num_batches * width) % size
     batches = jax.tree.map(lambda x: x[indices].reshape(num_batches, width, *x.shape[1:]), args)
@@ -167,10 +167,10 @@ def map_in_batches(
 
 
 def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., T]:
-    """A function of one element whose `vmap` takes so many elements at a time on a CPU.
+    """`fn`; but on a CPU its `vmap` takes only `width` elements at a time.
 
-    Plain form: `fn`, which `vmap` moves for all elements at once, through all their memory in each
-    step: TD3 with two layers of 256 units takes 1.7 times as long then. It is `fn` elsewhere.
+    Plain form: `fn`. Its `vmap` steps all elements at once and passes through all their memory in
+    each step: TD3 with two layers of 256 units takes 1.7 times as long.
 
     Args:
       fn: a function of one element.
@@ -202,7 +202,7 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
             batched = tuple(leaf for x, leaf in zip(is_batched, leaves, strict=True) if x)
             return map_in_batches(run, min(width or size, size), batched)
 
-        # Under a second `vmap` one such map follows the other.
+        # Under a second `vmap` the maps run one after the other.
         out = in_batches_on_cpu(all_of_them, width and 1)(*args)
         return out, jax.tree.map(lambda _: True, out)
 

@@ -3,14 +3,14 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_TIE = 1e-6  # of the score that others are compared with, or of 1 where that is smaller
+_TIE = 1e-6  # of the other score, or of 1 if that score is smaller
 
 
 def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "*n"]:
-    """Whether scores are equal to another one but for rounding.
+    """Whether scores equal another score, but for rounding.
 
     In single precision the mean of equal scores may differ from them in its last digits. Divided by
-    each other, such differences would be large weights. The authors' code asks for 1e-6 as well.
+    each other, such differences would give large weights. The authors' code has 1e-6 as well.
     """
     return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
 
@@ -22,12 +22,12 @@ def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
 
 
 def or_minus_inf(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Scores in which what is not finite is minus infinity."""
+    """The scores, with minus infinity in place of those that are not finite."""
     return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
 
 
 def or_lowest_finite(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Scores in which what is not finite is the worst finite one, or 0 if there is none."""
+    """The scores, with the worst finite one (or 0) in place of those that are not finite."""
     finite = jnp.isfinite(scores)
     worst = jnp.min(jnp.where(finite, scores, jnp.inf))
     return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))

@@ -1,8 +1,8 @@
 """The contract of a proxy: an environment with weights that stands in for a real task.
 
 A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent trains in
-it as in any other environment. What the inner loop must know beside that is in `ProxyEnv.is_real`,
-`ProxyEnv.max_steps` and `ProxyEnv.prepare`.
+it as in any other environment. The inner loop also needs `ProxyEnv.is_real`, `ProxyEnv.max_steps`
+and `ProxyEnv.prepare`.
 """
 
 import copy
@@ -20,9 +20,8 @@ from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
 from sejax.options import ConfigError, Options, as_text, shortened
 
-# A reward or an entry of a state that networks make ends the episode beyond this; what is the real
-# task's own may be larger. It is far outside what networks of sane weights make, and small enough
-# for its square to stay finite in float32.
+# An episode ends if a network's reward or entry of a state is beyond this. The real task's own
+# values may be larger. Networks of sane weights stay far below it; its square is finite in float32.
 MAX_ABS_VALUE = 1e6
 
 
@@ -32,8 +31,8 @@ class ProxyConfig(Options, ABC):
 
     Attributes:
       default_objective: name of the objective that `python -m sejax.run proxy=...` takes.
-      has_real_dynamics: whether agents step the real task. Their steps then count as real ones, and
-        the task's step limit is one that agents may treat as terminal.
+      has_real_dynamics: whether agents step the real task. Then their steps count as real steps,
+        and agents may treat the task's step limit as terminal.
     """
 
     group: ClassVar[str] = "proxy"
@@ -59,7 +58,7 @@ class ProxyConfig(Options, ABC):
         return False
 
     def max_steps(self, task_max_steps: int) -> int:
-        """Maximum number of steps of an episode, given the real task's."""
+        """Maximum number of steps of an episode, given that of the real task."""
         return task_max_steps
 
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
@@ -70,7 +69,7 @@ class ProxyConfig(Options, ABC):
         """
 
     def _error(self, name: str, value: object, why: str) -> ConfigError:
-        """Error for a field of which something else leaves one value; `why` follows that value."""
+        """Error for a field with one allowed value; in the message `why` follows that value."""
         field, fix, got = f"{self.group}.{name}", as_text(value), as_text(getattr(self, name))
         must = f"{field} must be {fix} {shortened(why, 120)}"
         return ConfigError(f"{must}; got {shortened(got)}. Set {field}={fix}.", field)
@@ -97,8 +96,9 @@ class ProxyEnv(Environment, ABC):
     Attributes:
       task: the real task, whose spaces the proxy has.
       config: the configuration that it was made from.
-      bare: the same without default params: one object for all stored proxies of a configuration.
-      learned_config: what a stored proxy was learned with, nested plain values; None for others.
+      bare: the same without default params. Stored proxies of one configuration share this object.
+      learned_config: configuration that a stored proxy was learned with, nested plain values; None
+        for others.
     """
 
     def __init__(self, task: Task, config: ProxyConfig):
@@ -118,14 +118,14 @@ class ProxyEnv(Environment, ABC):
 
         Args:
           weights: as from `init_weights`.
-          discount: gamma of the agent that trains on it; most proxies have no use for it.
+          discount: gamma of the agent that trains on it; most proxies ignore it.
         """
         return ProxyParams(weights=weights, max_steps_in_episode=self.max_steps)
 
     def prepare(
         self, params: PyTree, discount: Array | float | None, limit_is_terminal: bool = False
     ) -> Any:
-        """The same params for the whole training of one agent.
+        """Params for the whole training of one agent, prepared once.
 
         Args:
           params: of the proxy.

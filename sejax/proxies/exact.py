@@ -1,17 +1,17 @@
-r"""One-step SEs whose best policy is known: written down, with nothing fitted.
+r"""One-step SEs with a known best policy; their weights are computed, not fitted.
 
 The reward of a one-step SE says which action is best in a state, so that it can be built from a
-policy. Where actions are continuous, the reward is minus the distance to the policy's action. Where
-they are discrete, each action that the policy likes better costs, in a network of ReLUs that is no
-approximation:
+policy. For continuous actions the reward is minus the distance to the policy's action. For discrete
+actions, each action that the policy likes better than the chosen one costs; a network of ReLUs
+computes this without approximation:
 
 .. math:: r(s, a) = -\sum_i |a_i - \mathrm{clip}(u_i(s))| \qquad
    r(s, a) = -\sum_j \mathrm{clip}((u_j(s) - u_a(s)) / m, 0, 1)
 
 Episodes begin in a Gaussian with the mean and covariance of states that the policy visited.
 
-Such an SE is its policy in disguise: no agent was trained to learn it, and what it costs is what
-the policy cost (`sejax.distillation`).
+Such an SE is its policy in disguise: no agent was trained to learn it, and its cost is the cost of
+the policy (`sejax.distillation`).
 
 Source: ours; one-step SEs with learned initial states are those of Liesen et al. (2024).
 """
@@ -41,8 +41,8 @@ def make_exact(
     Args:
       task: the real task, whose observations are vectors.
       layers: the policy, affine maps of the observation with ReLUs between them. Continuous actions
-        are its output `[action_dim]`, clipped to the task's bounds; of discrete ones the one with
-        the largest output `[num_actions]` is best.
+        are its output `[action_dim]`, clipped to the task's bounds; the best discrete action is the
+        one with the largest output `[num_actions]`.
       states: observations that the policy visited, `[state, obs_dim]`, in the task's units.
       independent_starts: whether the numbers of an initial state are independent; else they have
         the covariance of the visited states.
@@ -97,7 +97,7 @@ def require_vectors(task: Task) -> None:
 
 
 def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:
-    """The policy in units of the bound, with a hidden layer at least: x is relu(x) - relu(-x)."""
+    """The policy in units of the bound, with at least one hidden layer: x = relu(x) - relu(-x)."""
     *hidden, (kernel, bias) = layers
     if not hidden:
         unit = np.eye(len(kernel))
@@ -107,17 +107,17 @@ def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:
 
 
 def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
-    """Minus what an action, one-hot, costs for each that the policy likes better.
+    """Layers for minus the cost of a one-hot action: the sum over all actions that are better.
 
-    An action that is better by the margin m, or more, costs 1; a tenth of such differences in
-    the given states are smaller than m, so that nearly every wrong action costs as much.
+    An action that is better by the margin m, or more, costs 1. Only a tenth of the differences in
+    the given states are smaller than m, so that nearly every better action costs the same.
     """
     outputs = evaluate(layers, states)
     size = outputs.shape[1]
     better, chosen = np.nonzero(~np.eye(size, dtype=bool))  # [pair], both
     differences = np.abs(outputs[:, better] - outputs[:, chosen])
     margin = max(float(np.quantile(differences, 0.1)), 1e-6 * float(np.abs(outputs).max()), 1e-9)
-    # The network's input is the one-hot action before the observation; each layer hands it on.
+    # The network's input is the one-hot action, then the observation. Each layer keeps the action.
     *hidden, (kernel, bias) = (
         (block_diag(np.eye(size), kernel), np.concatenate([np.zeros(size), bias]))
         for kernel, bias in layers
@@ -127,23 +127,23 @@ def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
     # relu(x) - relu(x - 1) is clip(x, 0, 1).
     kernel = np.concatenate([action, apart, apart])
     clipped = kernel, np.concatenate([bias[:size], shift, shift - 1])
-    # relu(clip - 1 + a) is clip for the action that was chosen, and 0 for others.
+    # relu(clip - 1 + a) is clip for the chosen action (a = 1), and 0 for others (a = 0).
     pairs = np.eye(len(better))
     costs = np.concatenate([np.eye(size)[chosen], pairs, -pairs], axis=1), -np.ones(len(better))
     return [*hidden, clipped, costs, (np.full((1, len(better)), -1.0), np.zeros(1))]
 
 
 def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
-    """Layers that turn standard normal noise n into a move, so that n and it have the moments.
+    """Layers that turn standard normal noise n into a move: n + move has the states' moments.
 
-    The mean and covariance of n + move are those of the states. relu(n + c) - c is n but for noise
-    below -c. Numbers that are `independent` have no covariance.
+    These are the mean and the covariance; with `independent` the covariances are 0. relu(n + c) - c
+    is n, except for noise below -c.
     """
     mean, size = states.mean(axis=0), states.shape[1]
     spread = np.cov(states, rowvar=False).reshape(size, size)
     if independent:
         spread = np.diag(np.diag(spread))
-    # A number that does not vary keeps a deviation that is far below rounding.
+    # A number that does not vary gets a deviation far below rounding.
     root = np.linalg.cholesky(spread + 1e-10 * np.eye(size) * max(1.0, np.abs(spread).max()))
     kernel = root - np.eye(size)
     shift = np.full(size, _MOST_NOISE)
@@ -151,7 +151,7 @@ def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
 
 
 def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
-    """Weights of a network with equally wide hidden layers, which zeros fill up."""
+    """Weights of a network with equally wide hidden layers; zeros fill up narrower layers."""
     weights, width = {}, layers[0][0].shape[1]
     for i, (kernel, bias) in enumerate(layers):
         missing = hidden_size - len(bias) if i < len(layers) - 1 else 0
@@ -167,7 +167,7 @@ def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
 def evaluate(layers: Sequence[Layer], inputs: Vector) -> Vector:
     """The policy's outputs `[state, action_dim]` for states `[state, obs_dim]`, before clipping.
 
-    Of NumPy or JAX.
+    Arrays are of NumPy or JAX.
     """
     *hidden, (kernel, bias) = layers
     for inner, shift in hidden:

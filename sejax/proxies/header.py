@@ -1,9 +1,9 @@
 """What a proxy's file holds, read without JAX: tensors, and a header of plain values.
 
 A file is in the safetensors format, with a checksum. It holds one proxy, or a set of proxies that
-share a configuration, whose tensors then have a leading axis over them. Nothing that a file says is
-executed, resolved or imported when it is read. `sejax.proxies.io` makes environments of it for JAX,
-`sejax.gym` some for Gymnasium.
+share a configuration. The tensors of a set have a leading axis over its proxies. Reading a file
+executes, resolves and imports nothing that the file names. `sejax.proxies.io` makes environments
+for JAX of it, and `sejax.gym` environments for Gymnasium.
 """
 
 import os
@@ -30,12 +30,12 @@ from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
-# What a caller gives for parts that no file can name: arguments of `sejax.load` by their groups,
-# and the words of a command.
+# A caller must give the parts that no file can name: by group, the arguments of `sejax.load`, and
+# the words of a command.
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
-KIND = "sejax"  # of the metadata's entry
-# The default at the time of files that do not say it.
+KIND = "sejax"  # name of the metadata's entry
+# Fields that older files lack, with the defaults of that time.
 UNSAID = {"training": {"time_limit_is_terminal": True}}
 
 
@@ -44,7 +44,7 @@ class Header:
     """Metadata of a file, all of it plain values.
 
     Attributes:
-      format_version: version of the format, of which this module reads one.
+      format_version: version of the format; this module reads only one.
       task: name of the real task.
       interface: the task's spaces and step limit, see `sejax.Task.interface`.
       config: configuration that the proxies were learned with; at least `env` and `proxy`.
@@ -78,7 +78,7 @@ class Header:
         spec = self.spec
         sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
         are_counts = all(type(size) is int and 0 < size <= LARGEST for size in sizes)
-        with np.errstate(over="ignore"):  # nan, and bounds beyond single precision, are changed
+        with np.errstate(over="ignore"):  # `spec` changes nan, and bounds beyond single precision
             is_same = spec.interface == self.interface
         if not (are_numbers and are_counts and is_same):
             raise ValueError("a number, a space or a step limit that no proxy has")
@@ -109,7 +109,7 @@ class Stored(NamedTuple):
 
 
 def _sizes_of(space: Space) -> list[int]:
-    """The numbers that count something in a space; 0 if its bounds do not fit."""
+    """The counts in a space; 0 if a lower bound exceeds the upper one."""
     if not isinstance(space, Box):
         return [space.n]
     are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
@@ -141,7 +141,7 @@ def configured(group: str, values: object, where: str) -> Any:
       where: the file, for messages.
 
     Raises:
-      ConfigError: if they are none, or of a name that is not registered.
+      ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
         return registry.configure(group, values)  # type: ignore[arg-type]
@@ -165,7 +165,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     """The file that a run directory, a path, a shipped name or an address on the Hub stands for.
 
     Args:
-      source: as of `sejax.load`.
+      source: as in `sejax.load`.
       option: name of the argument, for messages.
       also: names beside the shipped ones, for messages.
 
@@ -196,10 +196,10 @@ def read(
     """Tensors and header of a file, whose checksum is verified.
 
     Args:
-      source: as of `find`.
+      source: as in `find`.
       option: name of the argument, for messages.
-      kinds: kinds of proxies, one of which it must hold; empty for any.
-      single: whether it must hold one proxy.
+      kinds: allowed kinds of proxies; empty for any.
+      single: whether the file must hold one proxy.
 
     Raises:
       ConfigError: if there is no such file, it is damaged or of another format, or it holds a set

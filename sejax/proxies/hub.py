@@ -1,9 +1,9 @@
 """Files on the Hugging Face Hub, by `huggingface_hub` (the extra `hub`), which is imported if used.
 
 An address is `hf://USER/REPO`, with a revision (branch, tag or commit) after `@`, and the file's
-path at the end unless it is `proxy.safetensors`: `hf://USER/REPO@v1/cartpole.safetensors`. A file
-is fetched if it is a safetensors file of bounded size, and kept in the Hub's own cache, which
-serves without a network.
+path at the end unless it is `proxy.safetensors`: `hf://USER/REPO@v1/cartpole.safetensors`. Only
+safetensors files of bounded size are fetched. The Hub's own cache keeps them, and works without a
+network.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ _ADDRESS = re.compile(
 
 
 def is_address(source: object) -> bool:
-    """Whether a source means the Hub."""
+    """Whether a source is an address on the Hub."""
     return str(source).startswith(SCHEME)
 
 
@@ -101,7 +101,7 @@ def _explained(option: str, address: str) -> Iterator[None]:
         yield
     except ConfigError:
         raise
-    except Exception as error:  # the HTTP library's too, which differs between its versions
+    except Exception as error:  # the HTTP library's too, which depends on huggingface_hub's version
         is_missing = isinstance(error, ImportError)
         fix = "Check the name and the network, or log in: hf auth login"
         fix = "Install it with pip install 'sejax[hub]'" if is_missing else fix

@@ -48,16 +48,16 @@ class _Loaded:
 
     @property
     def task(self) -> Task:
-        """The real task; its spaces alone, if it cannot be made here and an SE needs no more."""
+        """The real task; only its spaces if it cannot be made here and an SE needs no more."""
         return self.env.task
 
     def learned_with(self, group: str) -> Any:
         """A part of the configuration that it was learned with, such as `agent` or `es`.
 
-        `sejax.training_of` reads its training.
+        For its training see `sejax.training_of`.
 
         Raises:
-          ConfigError: if the file does not tell it, or names one that is not registered, because a
+          ConfigError: if the file lacks the part, or names one that is not registered, because a
             file's names are never imported.
 
         Example:
@@ -90,7 +90,7 @@ class Proxy(_Loaded):
     Attributes:
       env: the SE or RN, a gymnax environment whose `default_params` are the params.
       params: its `EnvParams`: the weights, and the discount of the agent it was learned with.
-      record: what is known of it: `score`, `generation` and `seed`, where they are.
+      record: what is known of it, such as `score`, `generation` and `seed`.
       config: configuration that it was learned with, nested plain values.
       discount: gamma of the agent that it was learned with.
       path: the file.
@@ -122,8 +122,8 @@ class ProxySet(_Loaded):
       env: the SE or RN that they share; its `default_params` are random.
       weights: leaves `[proxy, ...]`, NumPy float32. To `vmap` over the proxies:
         `vmap(lambda w: f(env.params(w, discount)))(weights)`.
-      records: of each proxy what is known of it: `score` (mean of the incumbent that it was chosen
-        for), `generation` (that measured it) and `seed` (of its run).
+      records: what is known of each proxy: `score` (incumbent mean for which it was chosen),
+        `generation` (in which it was measured) and `seed` (of its run).
       config: configuration that they were learned with, nested plain values, with the first seed.
       discount: gamma of the agent that they were learned with.
       path: the file.
@@ -161,7 +161,7 @@ class ProxySet(_Loaded):
         return np.array([record.get("seed", -1) for record in self.records])
 
     def ranked(self, count: int, worst: bool = False) -> "ProxySet":
-        """Those with the highest scores, the best first; or the lowest, the worst first."""
+        """`count` proxies: the best, best first; or with `worst` the worst, worst first."""
         order = np.argsort(self.scores, kind="stable")
         return self[(order if worst else order[::-1])[:count]]
 
@@ -207,11 +207,11 @@ def training_of(
 
     Args:
       proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
-      agent: configuration of another agent that is to train on it, whose budget is then that of
-        `budget_for`; None for the training as it was.
+      agent: configuration of another agent that is to train on it; `budget_for` then adapts the
+        budget. None for the training as it was.
 
     Raises:
-      ConfigError: for a proxy that is not stored, or if its file does not tell it.
+      ConfigError: for a proxy that is not stored, or whose file has no training.
 
     Example:
       >>> training_of(load_proxy("cartpole")).stop_rule
@@ -240,16 +240,17 @@ def budget_for(
 ) -> TrainingConfig:
     """How long an agent trains on a proxy that was learned with others.
 
-    A step budget grows by the steps for which this agent waits longer with learning than any of
-    those: ten long initial episodes, or a rollout of PPO, could use it up. Episodes, which may have
-    one step, grow in number with it. No more steps are asked for than there were episodes for.
+    An agent may begin to learn later than all agents that the proxy was learned with. Ten long
+    initial episodes, or a rollout of PPO, could use up a step budget. So the budget grows by the
+    additional wait. The number of episodes grows as much, because an episode may have one step. No
+    more steps are asked for than there were episodes for.
 
     Args:
-      training: that the proxy was learned with.
+      training: training with which the proxy was learned.
       agent: configuration of the agent that is to train.
-      learned_with: of those that the proxy was learned with, as far as they are known.
-      max_episode_steps: that the proxy's episodes may take.
-      task_max_steps: that the real task's may take.
+      learned_with: configurations of the agents that the proxy was learned with, as far as known.
+      max_episode_steps: step limit of the proxy's episodes.
+      task_max_steps: step limit of the real task's episodes.
     """
     max_steps = training.max_steps
     if max_steps is None:
@@ -309,7 +310,7 @@ def save_set(
     discount: float | None = None,
     is_set: bool = True,
 ) -> None:
-    """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
+    """Writes a set of proxies atomically; arguments as in `save`, with a record for each.
 
     With `is_set=False` the file holds a single proxy, as `save` writes it.
 
@@ -332,7 +333,7 @@ def save_set(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            # Without the path of the machine that a run was on.
+            # Without the folder, which is a path on the machine of the run.
             config={**known, **(config or {}), "run_dir": None},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
@@ -350,7 +351,7 @@ def save_set(
 def _require_weights(
     field: str, tensors: Mapping[str, np.ndarray], env: ProxyEnv, count: int, fix: str
 ) -> None:
-    """Checks the tensors of so many proxies, by `network/layer/parameter`."""
+    """Checks the tensors of `count` proxies, by `network/layer/parameter`."""
     weights = jax.eval_shape(env.init_weights, jax.random.key(0))
     shapes = {name: (count, *x.shape) for name, x in flatten_dict(weights, sep="/").items()}
     check_tensors(field, tensors, shapes, fix)
@@ -364,16 +365,15 @@ def load(
 ) -> tuple[ProxyEnv, Any]:
     """Loads a proxy as a gymnax environment and its params (the weights).
 
-    The discount of a potential-based RN is that of the agent it was learned with. For another one
-    take `params.replace(discount=...)`; `make_trainer` does so by itself.
+    The discount of a potential-based RN is that of the agent it was learned with. For an agent with
+    another discount take `params.replace(discount=...)`; `make_trainer` does so by itself.
 
     Args:
       source: a run directory, a safetensors file, the name of a proxy that ships with the package
         (`sejax.pretrained()`), or one on the Hugging Face Hub: `hf://USER/REPO`.
       task: the real task; needed if no registered name makes it, because a file's names are never
-        imported. An SE whose initial states are not the real task's needs none, and not the package
-        of its task either: its file has the spaces, and only resetting or stepping the real task
-        fails.
+        imported. An SE with initial states of its own needs neither the task nor the task's
+        package: its file has the spaces. Only resetting or stepping the real task then fails.
       proxy: the proxy's configuration; needed for a kind of proxy of your own.
 
     Returns:
@@ -404,9 +404,9 @@ def load_proxy(
     """As `load`, with the real task, the configuration and the record.
 
     Args:
-      source: as of `load`.
-      task: as of `load`.
-      proxy: as of `load`.
+      source: as in `load`.
+      task: as in `load`.
+      proxy: as in `load`.
       option: name of `source` in messages.
     """
     return load_set(source, task, proxy, option, single=True)[0]
@@ -424,10 +424,10 @@ def load_set(
 
     Args:
       source: a file of `save_set`, or whatever `load` takes.
-      task: as of `load`.
-      proxy: as of `load`.
+      task: as in `load`.
+      proxy: as in `load`.
       option: name of `source` in messages.
-      kind: "se" or "rn", which the proxies must be; None for any.
+      kind: kind that the proxies must have, "se" or "rn"; None for any.
       single: whether the file must hold one proxy.
 
     Raises:
@@ -501,7 +501,7 @@ class AbsentEnv(Environment):
 
 @functools.cache
 def _absent_task(name: str, known: str, reason: str) -> Task:
-    """A task of which no more is known than what a proxy's file says; built once.
+    """A task that is known only from a proxy's file; built once.
 
     Args:
       name: of the task.
@@ -522,7 +522,7 @@ def register_gymnax() -> list[str]:
     Returns:
       The ids, for `gymnax.make`. The environment's `default_params` are the learned weights.
     """
-    from gymnax import registration  # all of its environments, which takes a second
+    from gymnax import registration  # imports all of gymnax's environments, which takes a second
 
     ids = {f"sejax/{name}": name for name in header.pretrained_names()}
     for env_id in ids.keys() - set(registration.registered_envs):

@@ -30,8 +30,8 @@ class Shaping(NamedTuple):
       is_additive: whether the real reward r is added.
       is_potential_based: whether a step is worth :math:`\gamma \Phi(s') - \Phi(s)`, and not
         :math:`\Phi(s')`.
-      weighs_info: whether there is no network, but a weight for each number i' in the step's `info`
-        (`Task.info_keys`).
+      weighs_info: whether, in place of a network, there is a weight for each number i' in the
+        step's `info` (`Task.info_keys`).
     """
 
     is_additive: bool
@@ -90,7 +90,7 @@ class RewardConfig(ProxyConfig):
         return self.shaping.is_potential_based
 
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
-        """Checks that the steps of the task tell what this variant needs.
+        """Checks that the task's steps report what this variant needs.
 
         Raises:
           ConfigError: if they do not.
@@ -105,7 +105,7 @@ class RewardConfig(ProxyConfig):
         """The RN of a task.
 
         Raises:
-          ConfigError: if the task does not tell what this variant needs.
+          ConfigError: if the task's steps do not report what this variant needs.
         """
         self.require_task(task, task.name)
         return RewardEnv(task, self)
@@ -145,23 +145,23 @@ class RewardEnv(ProxyEnv):
 
     where gamma is the agent's discount. A discrete state is one-hot to the network. With
     `zero_at_terminal` :math:`\Phi` is 0 where the episode ends for the agent: where it terminates,
-    and at the step limit if agents do not bootstrap there. That is what makes `additive_potential`
+    and at the step limit if agents do not bootstrap there. Only then does `additive_potential`
     leave the optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's
-    value. An agent that repeats its actions gets the sum of the rewards of all steps, shaped each
-    with the discount of a whole decision, as in the authors' code; for it the potentials of the
-    steps between do not cancel.
+    value. An agent that repeats its actions gets the sum of the rewards of all steps. As in the
+    authors' code, each step is shaped with the discount of a whole decision, so that for this agent
+    the potentials of the steps between do not cancel.
 
     :math:`\Phi` is the network's output times `output_scale`, 1 in the paper.
 
     `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
-    :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both, and on
-    HalfCheetah the two parts of the reward beside position and velocity. The last two
-    variants, baselines of the authors' code, weigh the numbers i' in the step's `info`
+    :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both. On HalfCheetah
+    its v has the two parts of the reward beside position and velocity. The last two variants are
+    baselines of the authors' code: they weigh the numbers i' in the step's `info`
     (`Task.info_keys`) and have no network.
 
     `info["real_reward"]` is r, of any size. A reward that is not finite, or whose learned part is
-    beyond `MAX_ABS_VALUE`, is 0 and ends the episode; `info["nonfinite"]` says whether it was not
-    finite.
+    beyond `MAX_ABS_VALUE`, becomes 0 and ends the episode. `info["nonfinite"]` says whether the
+    reward was not finite.
     """
 
     config: RewardConfig
@@ -185,10 +185,10 @@ class RewardEnv(ProxyEnv):
     def prepare(
         self, params: RewardParams, discount: Array | float | None, limit_is_terminal: bool = False
     ) -> RewardParams:
-        """The same params for the whole training of one agent, with its discount.
+        """Params for the whole training of one agent, with its discount.
 
-        Where states are discrete, all potentials are computed at once, and a step looks its two up.
-        They belong to these weights: with other weights call it again.
+        If states are discrete, all potentials are computed at once, and each step looks up two of
+        them. They are those of these weights: with other weights call it again.
 
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.

@@ -50,24 +50,24 @@ class Units(NamedTuple):
 class SyntheticConfig(ProxyConfig):
     """The SE's networks, where its episodes begin, and how they end.
 
-    The default is the contextual bandit of Liesen et al. (2024): everything about it is seen by any
-    agent. The paper's SE is `initial_state=real horizon=null done=soft`.
+    The default is the contextual bandit of Liesen et al. (2024): any agent sees everything about
+    it. The paper's SE is `initial_state=real horizon=null done=soft`.
 
     Attributes:
       done: How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 -
-        d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1). Agents
-        see all ends but the first.
-      min_steps: First step of an episode that d may end it at; before it, targets bootstrap with 1.
-        An SE of episodes of a step or two is a one-step SE, whatever its networks could do.
+        d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1). With
+        soft, agents outside of sejax do not see 1 - d.
+      min_steps: First step at which d may end an episode; before it, targets bootstrap with 1. If
+        episodes last a step or two, the SE is a one-step SE, whatever its networks could do.
       initial_state: real: the task's initial states; learned: standard normal noise plus a
         network's output for it; noise: noise alone, in the units of `state_units`.
       state_units: Units in which the networks see and make states. raw: the task's own; bounds: 0
         is the middle of a bounded observation and 1 is half of the way to its bound. A car's
-        velocity lies in [-0.07, 0.07], where noise of 1 would be no measure.
-      horizon: Steps of an episode, the last of which terminates it; null: the task's limit, which
+        velocity lies in [-0.07, 0.07]; there noise of 1 would be far too large.
+      horizon: Steps of an episode; the last step terminates it. null: the task's limit, which
         truncates it. 1: a one-step SE, which has neither a next-state nor a done network.
-      reward_form: What the reward network of a one-step SE makes. network: the reward of an action;
-        distance: the best of continuous actions, in units of their bound. The reward is minus the
+      reward_form: Output of a one-step SE's reward network. network: the reward of an action;
+        distance: the best continuous action, in units of the bound. The reward is then minus the
         sum of the distances from it, so that the best policy is known.
     """
 
@@ -100,10 +100,10 @@ class SyntheticConfig(ProxyConfig):
         return self.initial_state == "real"
 
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
-        """Checks that the reward's form is one for the task's actions.
+        """Checks that the form of the reward fits the task's actions.
 
         Raises:
-          ConfigError: if it is not.
+          ConfigError: if it does not fit.
         """
         if self.reward_form != "network" and spec.num_actions is not None:
             why = f"for discrete actions, as of {task_name}"
@@ -156,7 +156,7 @@ class SyntheticConfig(ProxyConfig):
         """The SE of a task.
 
         Raises:
-          ConfigError: for a form of the reward that is not one for the task's actions.
+          ConfigError: if the form of the reward does not fit the task's actions.
         """
         self.require_task(task, task.name)
         return (BanditEnv if self.is_bandit else SyntheticEnv)(task, self)
@@ -171,28 +171,28 @@ class SyntheticEnv(ProxyEnv):
     r"""A task whose dynamics, reward and termination are networks; a gymnax 1.x `Environment`.
 
     Each network maps the action (one-hot if discrete) and the state to the next state, the reward
-    or the done output d. Where states are discrete, the networks' state is a vector with an entry
-    for each of them, one-hot at first and then the next-state network's output; the agent observes
-    the index of its largest entry.
+    or the done output d. If states are discrete, the networks' state is a vector with an entry for
+    each state. At first it is one-hot; later it is the next-state network's output. The agent
+    observes the index of the largest entry.
 
     The configuration chooses how episodes begin and end:
 
     - `initial_state`: the real task's; or standard normal noise; or learned: noise plus a network's
       output for it, so that the initial states of a fresh SE surround the origin.
-    - `done`: how d terminates an episode. `info["discount"]` is what a target bootstraps with: with
-      "soft" 1 - d itself (a learned discount, not confined to [0, 1], which agents outside of sejax
-      do not see), else 1 - terminated. "bernoulli" is that discount, clipped to [0, 1], as any
-      agent sees it: an end of probability 1 - clip(1 - d, 0, 1) = clip(d, 0, 1), so that targets
-      are the same on average. Rewards cannot take its place: what a target loses by it is
-      :math:`\gamma d V(s')`, of the agent's own values.
-    - `min_steps`: the first step that d may end an episode at.
+    - `done`: how d terminates an episode. Targets bootstrap with `info["discount"]`. With "soft" it
+      is 1 - d: a learned discount, not confined to [0, 1], which agents outside of sejax do not
+      see. Else it is 1 - terminated. "bernoulli" shows the soft discount, clipped to [0, 1], to any
+      agent: episodes end with probability 1 - clip(1 - d, 0, 1) = clip(d, 0, 1), so that targets
+      are the same on average. Rewards cannot replace the discount: it takes :math:`\gamma d V(s')`
+      from a target, which depends on the agent's own values.
+    - `min_steps`: the first step at which d may end an episode.
     - `horizon`: steps of an episode. The last one terminates it. At the task's own limit, with no
       horizon, the episode is truncated.
 
     Continuous actions are clipped to the task's bounds, as by the task itself.
 
     An output that is not finite, or beyond `MAX_ABS_VALUE`, ends the episode: the state stays where
-    it was, the reward is 0, and `info["nonfinite"]` says whether it was not finite.
+    it was, the reward is 0, and `info["nonfinite"]` says whether the output was not finite.
     """
 
     config: SyntheticConfig
@@ -208,7 +208,7 @@ class SyntheticEnv(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
-        # Always a key for "start", too, so that stored runs keep their numbers.
+        # "start" always takes a key, so that stored runs keep their numbers.
         keys = jax.random.split(key, len(self._networks.keys() | {"start"}))
         return {
             name: self._net(name).init(network_key, jnp.zeros(units[0]))["params"]
@@ -252,7 +252,7 @@ class SyntheticEnv(ProxyEnv):
             if self.config.initial_state == "learned":
                 vector = noise + self._apply(params.weights, "start", noise)
             vector = vector if self._units is None else self._units.decode(vector)
-            # At the limit, and not beyond it: the first step from there ends the episode.
+            # Clipped to the limit, not beyond: the first step from there ends the episode.
             vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.observe(state), state
@@ -260,7 +260,7 @@ class SyntheticEnv(ProxyEnv):
     def step_env(
         self, key: Array, state: SyntheticState, action: Array, params: ProxyParams
     ) -> tuple[Array, SyntheticState, Array, Array, dict[Any, Any]]:
-        if self.task.num_actions is None:  # beyond its bounds the networks were never taught
+        if self.task.num_actions is None:  # the networks never learned beyond the bounds
             action = jnp.clip(action, -self.task.max_action, self.task.max_action)
         vector, reward, done = self.predict(params.weights, state.vector, action)
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
@@ -288,7 +288,7 @@ class SyntheticEnv(ProxyEnv):
         return done > 0.5
 
     def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Array:
-        """Whether the episode is at its limit, unless that terminates it."""
+        """Whether the episode is at its limit. Never with a horizon, which terminates instead."""
         if self.config.horizon is not None:
             return jnp.bool_(False)
         return super().is_truncated(state, params)
@@ -324,5 +324,5 @@ class BanditEnv(SyntheticEnv):
     def bandit_reward(
         self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array
     ) -> Float[Array, ""]:
-        """The reward of an action, where states are what agents observe."""
+        """The reward of an action in a state that agents observe as it is."""
         return self.predict(weights, obs, action)[1]

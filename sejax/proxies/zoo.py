@@ -1,6 +1,6 @@
 """The proxies that ship with the package, model cards, and sharing on the Hugging Face Hub.
 
-All of it reads a file's header without JAX. `tools/ship_proxy.py` writes the shipped files,
+This module reads headers of files without JAX. `tools/ship_proxy.py` writes the shipped files, and
 `tools/make_zoo.py` makes `docs/zoo.md` of them.
 """
 
@@ -27,7 +27,7 @@ class Evaluation:
     Attributes:
       agent: name of the kind, such as `ddqn`.
       hparams: default, varied (drawn for each agent) or as_learned (those it was learned with).
-      world: where they trained: proxy, or real, the task itself.
+      world: where the agents trained: proxy, or real, the task itself.
       num_agents: number of agents.
       return_mean: mean of the agents' mean test returns, in the task's unit.
       return_std: standard deviation of the same.
@@ -51,9 +51,10 @@ class Learning:
       command: command that repeats it.
       generations: generations of the outer loop.
       real_steps: steps on the real task, tests included.
-      agents: number of agents that were trained; None if it was not recorded.
-      train_steps: steps of their trainings, which for an SE are none of the real task; likewise.
-      cpu_s: CPU seconds, compilation included; likewise.
+      agents: number of agents that were trained; None if not recorded.
+      train_steps: training steps of these agents, which for an SE are not steps of the real task;
+        None if not recorded.
+      cpu_s: CPU seconds, compilation included; None if not recorded.
     """
 
     command: str
@@ -73,13 +74,13 @@ class PretrainedProxy:
       kind: se, rn, or the name of another configuration.
       task: name of the task that it stands in for.
       settings: the proxy's configuration, plain values.
-      scores: mean score of the incumbent with each agent that it was learned with, in the
-        generation that the proxy is of; for an SE a test return. Empty if it was not recorded.
-      objective: name of the objective that the scores are of; "" if it was not recorded.
-      generation: generation that the proxy is of; None if it was not recorded.
-      seed: seed of its run; None if it was not recorded.
+      scores: mean score of the incumbent with each agent that it was learned with, in the proxy's
+        generation; for an SE a test return. Empty if not recorded.
+      objective: name of the scores' objective; "" if not recorded.
+      generation: generation that the proxy comes from; None if not recorded.
+      seed: seed of its run; None if not recorded.
       evaluations: results of fresh agents.
-      learning: its run; None if it was not recorded.
+      learning: its run; None if not recorded.
       policy_return: return of the policy that it was made of; None if it was learned with agents.
     """
 
@@ -158,11 +159,11 @@ _ROW = (  # of an evaluation
 def card_of(
     proxy: PretrainedProxy, source: str, needs: Sequence[str] = (), license: str = ""
 ) -> str:
-    """A proxy's model card: `card.md` with its values, without the parts that have none.
+    """A proxy's model card: `card.md` filled with its values. Parts without values are left out.
 
     Args:
       proxy: what its file tells.
-      source: what `sejax.load` takes; with the front matter that the Hub reads, if it is there.
+      source: what `sejax.load` takes. For an address on the Hub the card gets front matter.
       needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
         file's names are never imported.
       license: its name; that of the shipped proxies if it is empty.
@@ -179,7 +180,7 @@ def card_of(
     tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
     plain = to_plain(proxy)
     if proxy.learning:
-        plain["learning"].pop("command")  # which the card has below
+        plain["learning"].pop("command")  # the card shows it below
     facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
         "front": json.dumps(license) if hub.is_address(source) else None,
@@ -213,10 +214,10 @@ def push(
     a token that may write (`hf auth login`).
 
     Args:
-      source: one proxy, as of `sejax.load`.
+      source: one proxy, as in `sejax.load`.
       repo: `USER/REPO`; made if it is not there.
       private: whether a new repository is private.
-      license: name by which the Hub knows it; that of the shipped proxies if not given.
+      license: the Hub's name of the license; by default that of the shipped proxies.
 
     Returns:
       Its address, which `sejax.load` takes.
