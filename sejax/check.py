@@ -105,7 +105,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
     Args:
       proxy: a run directory, a file, or a shipped name.
-      **fields: of the command, such as `num_agents=40`.
+      **fields: fields of the command, such as `num_agents=40`.
 
     Returns:
       What `check.json` holds: `verdict`, `judgements` by agent, `null_se`, `cost` and `worlds`.

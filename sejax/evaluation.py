@@ -117,7 +117,7 @@ def make_tester(
 
     Args:
       agent: chooses the actions.
-      task: the real task; gives `params` by default.
+      task: the real task; its params are the default of `params`.
       num_episodes: episodes of each test.
       test_env: maps the task's environment, with the agent's action repeat, to the environment of
         the episodes; by default the same one.

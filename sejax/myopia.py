@@ -1,4 +1,4 @@
-"""The myopia test: does what is learned teach by its rewards alone, or by its dynamics?
+"""The myopia test: does a learned proxy teach by its rewards alone, or by its dynamics?
 
 An agent with a discount of 0 sees only the reward of its next step. A proxy that teaches it as much
 as a far-sighted agent is a policy in disguise, however long its episodes are.

@@ -30,8 +30,8 @@ class Outcome:
       scored_returns: returns of the same episodes, as `Objective.test_env` scores them.
       train_steps: steps in the training world.
       train_episodes: episodes in the training world.
-      auc: sum over training episodes of return times length. If there are tests between episodes,
-        the return is that of the tests after the episode. An episode that the step limit cut off
+      auc: sum over training episodes of return times length. If there are tests after each episode,
+        their mean return replaces the episode's return. An episode that the step limit cut off
         counts with the final test return.
       nonfinite: whether training met a number that is not finite; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.

@@ -68,7 +68,7 @@ class GenerationInfo:
     by_agent: AgentInfo
     population_scores: Float[Array, " evaluation"]
     train_steps: Array  # `[training]` int32; sums may exceed 32 bits and are made on the host
-    real_steps: Array  # likewise: steps on the real task
+    real_steps: Array  # in the same form: steps on the real task
     active: Array  # False if the run was over before this generation
 
 
@@ -119,7 +119,7 @@ class Scoring:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
 
         Args:
-          outcome: of all trainings, as from `sejax.generation.GenerationEvaluator`.
+          outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
         scores = self._scores(self.objective(outcome))
         by_candidate = scores.population.reshape(-1, self.evaluations.num_evals)

@@ -45,9 +45,9 @@ def make_agent(
     """The agent for a task's observations and actions; the same object for the same arguments.
 
     Args:
-      config: of the agent, such as `DDQNConfig()`.
+      config: configuration of the agent, such as `DDQNConfig()`.
       task: the real task, a `sejax.Task`.
-      exploration: intrinsic reward, such as `ICMConfig()`.
+      exploration: configuration of an intrinsic reward, such as `ICMConfig()`.
       varied: whether hyperparameters are drawn anew for each training (paper, appendix "Varied
         Agent Hyperparameters").
 

@@ -42,7 +42,7 @@ class Transition(NamedTuple):
     def rows(self) -> "Transition":
         """A feature-major batch transposed to `[batch, obs_dim]`, with weights `[batch]`.
 
-        A `jax.vmap` of a function of one transition takes it.
+        `jax.vmap` then maps a function of one transition over it.
         """
         weight = jnp.broadcast_to(self.weight, self.reward.shape)
         return jax.tree.map(jnp.transpose, self._replace(weight=weight))

@@ -36,7 +36,7 @@ class DDQNConfig(OffPolicyOptions):
       epsilon_init: share of random actions
       epsilon_decay: factor for each episode
       exploration_steps: If given, epsilon falls linearly over this many steps after the agent first
-        learns, not by episodes: for environments whose episodes have one or two steps.
+        learns, and not by episodes: for environments with episodes of one or two steps.
       double: the online network chooses the action in a target; else the target network does
     """
 

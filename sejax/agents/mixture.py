@@ -126,7 +126,7 @@ class Mixture:
 
         Args:
           scores: of the candidates; a score is not finite if training diverged, and stays so.
-          candidates: of each agent, as from `deal`.
+          candidates: of each agent, as returned by `deal`.
           incumbent_means: the incumbent's mean with each agent; nan if all evaluations with the
             agent diverged. The agent's candidates are then compared with their own mean.
         """

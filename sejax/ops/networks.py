@@ -102,7 +102,7 @@ class Dense(nn.Module):
 # A product over at most this many terms is written out as a sum. XLA fuses it with the operations
 # around it; a call of the matrix library would cost more than the arithmetic.
 _MAX_UNROLLED = 8
-_WIDE = 64  # a kernel with at least so many units is read row by row
+_WIDE = 64  # a kernel with at least this many units is read row by row
 
 
 @jax.custom_vjp

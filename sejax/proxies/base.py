@@ -81,7 +81,7 @@ class ProxyConfig(Options, ABC):
 
 @struct.dataclass
 class ProxyParams(EnvParams):
-    """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
+    """Weights of a proxy, in the form of its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
 
@@ -89,9 +89,9 @@ class ProxyParams(EnvParams):
 class ProxyEnv(Environment, ABC):
     """A proxy of a task; subclasses add `init_weights`, `reset_env` and `step_env`.
 
-    `step_env` may put two entries into its `info`: "discount", what a target bootstraps with before
-    the agent's gamma (1 minus terminated if it is not there), and "nonfinite", whether a number was
-    met that is not finite, which ends the training.
+    `step_env` may put two entries into its `info`. "discount" is the discount of a target, before
+    the agent's gamma; by default it is 1 minus terminated. "nonfinite" says whether the step met a
+    number that is not finite, which ends the training.
 
     Attributes:
       task: the real task, whose spaces the proxy has.
@@ -117,7 +117,7 @@ class ProxyEnv(Environment, ABC):
         """`EnvParams` of the proxy with these weights.
 
         Args:
-          weights: as from `init_weights`.
+          weights: in the form of `init_weights`.
           discount: gamma of the agent that trains on it; most proxies ignore it.
         """
         return ProxyParams(weights=weights, max_steps_in_episode=self.max_steps)

@@ -157,7 +157,7 @@ def configured(group: str, values: object, where: str) -> Any:
 
 
 def pretrained_names() -> list[str]:
-    """Names of the proxies that ship with the package, each of which agents train on."""
+    """Names of the proxies that ship with the package. Agents can train on each of them."""
     return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
 
 

@@ -278,7 +278,7 @@ def save(
     Args:
       path: the file, `*.safetensors`.
       env: the proxy.
-      weights: as from its `init_weights`; kept as float32.
+      weights: in the form of its `init_weights`; kept as float32.
       config: configuration that it was learned with, nested plain values; task and kind of proxy
         are added.
       discount: gamma of the agent that it was learned with, which a potential-based RN needs; 1 if

@@ -120,7 +120,7 @@ class RewardState(EnvState):
 
 @struct.dataclass
 class RewardParams(EnvParams):
-    weights: Any = None  # as from `init_weights`
+    weights: Any = None  # in the form of `init_weights`
     potentials: Array | None = None  # [num_states], if `prepare` found discrete states
     discount: Array | float = 1.0  # gamma; `prepare` puts the agent's here
     limit_is_terminal: Array | bool = False  # whether episodes end for the agent at the step limit
@@ -155,8 +155,8 @@ class RewardEnv(ProxyEnv):
 
     `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
     :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both. On HalfCheetah
-    its v has the two parts of the reward beside position and velocity. The last two variants are
-    baselines of the authors' code: they weigh the numbers i' in the step's `info`
+    the authors' v also has the two parts of the reward, beside position and velocity. The last two
+    variants are baselines of the authors' code: they weigh the numbers i' in the step's `info`
     (`Task.info_keys`) and have no network.
 
     `info["real_reward"]` is r, of any size. A reward that is not finite, or whose learned part is
@@ -188,7 +188,7 @@ class RewardEnv(ProxyEnv):
         """Params for the whole training of one agent, with its discount.
 
         If states are discrete, all potentials are computed at once, and each step looks up two of
-        them. They are those of these weights: with other weights call it again.
+        them. They hold for these weights alone: call it again for other weights.
 
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.
@@ -207,7 +207,7 @@ class RewardEnv(ProxyEnv):
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()
     ) -> Float[Array, ""]:
-        r""":math:`\Phi` of an observation of the task, and of v if augmented."""
+        r""":math:`\Phi` of an observation of the task and, if augmented, of v."""
         if params.potentials is not None:
             return params.potentials[obs]
         if self.task.num_states is not None:

@@ -166,7 +166,7 @@ def card_of(
       source: what `sejax.load` takes. For an address on the Hub the card gets front matter.
       needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
         file's names are never imported.
-      license: its name; that of the shipped proxies if it is empty.
+      license: name of the license; by default that of the shipped proxies.
     """
     kind = proxy.kind if proxy.kind in _KINDS else "other"
     call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
