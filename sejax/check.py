@@ -159,7 +159,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
 
 
 def _tuned(task: Task) -> AgentConfig:
-    """An agent with the settings of `preset=best`, but one warm-up episode: more help on SEs."""
+    """An agent with the settings of `preset=best`, but one warm-up episode: SEs alone need more."""
     name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
     beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
     fields = beside.get("agent", {}) | {"name": name, "warmup_episodes": 1}
@@ -213,7 +213,7 @@ def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
 def _told(
     proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
 ) -> dict[str, Any]:
-    """Prints and writes the findings. Agents score returns on an SE, training steps on an RN."""
+    """Prints and writes the findings. Scores are returns for an SE, training steps for an RN."""
     task, is_rn, is_lost = proxy.task, proxy.env.is_real, table["nonfinite"] > 0
     table["test_return"] = counted(table["test_return"].mask(is_lost))
     table["train_steps"] = table["train_steps"].mask(is_lost, table["train_steps"].max())

@@ -93,7 +93,7 @@ class PPOConfig(AgentOptions):
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:
-        """The paper's PPO with `changes`. Where the paper's table is silent, its code counts.
+        """The paper's PPO with `changes`: by its table and, where the table is silent, its code.
 
         The values are those for MountainCarContinuous, whose RNs add `action_repeat=5`.
 

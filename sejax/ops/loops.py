@@ -47,8 +47,8 @@ def while_any_active(
       The last `large` and `small`.
 
     Example:
-      One loop writes three numbers 1, 2, 3 into a log, another loop one. If `masked`, a stopped
-      loop's body writes beyond the end of the log, which changes nothing.
+      One loop writes 1, 2, 3 into a log, another loop only 1. If `masked`, a stopped loop's body
+      writes beyond the end of the log, which changes nothing.
 
       >>> from flax import struct
       >>> @struct.dataclass

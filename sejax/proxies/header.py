@@ -3,7 +3,7 @@
 A file is in the safetensors format, with a checksum. It holds one proxy, or a set of proxies that
 share a configuration. The tensors of a set have a leading axis over its proxies. Reading a file
 executes, resolves and imports nothing that the file names. `sejax.proxies.io` makes environments
-for JAX of it, and `sejax.gym` environments for Gymnasium.
+for JAX from it, and `sejax.gym` makes environments for Gymnasium.
 """
 
 import os

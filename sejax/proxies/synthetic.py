@@ -184,7 +184,7 @@ class SyntheticEnv(ProxyEnv):
       see. Else it is 1 - terminated. "bernoulli" shows the soft discount, clipped to [0, 1], to any
       agent: episodes end with probability 1 - clip(1 - d, 0, 1) = clip(d, 0, 1), so that targets
       are the same on average. Rewards cannot replace the discount: it takes :math:`\gamma d V(s')`
-      from a target, which depends on the agent's own values.
+      from a target, and this depends on the agent's own values.
     - `min_steps`: the first step at which d may end an episode.
     - `horizon`: steps of an episode. The last one terminates it. At the task's own limit, with no
       horizon, the episode is truncated.
