@@ -32,8 +32,9 @@ def start(
 
     Args:
       main: the command, a function of its overrides.
-      help_text: what `--help` prints beside these overrides.
-      configs_of: the configurations that `--print-config` prints, if the command has this option.
+      help_text: the text of `--help`, a function of the overrides.
+      configs_of: the configurations that `--print-config` prints, a function of the overrides; None
+        if the command lacks this option.
     """
     words = sys.argv[1:]
     if threading.current_thread() is threading.main_thread():
@@ -67,8 +68,8 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _devices(overrides: Sequence[str]) -> int | None:
-    """The number of devices that is asked for; 1 where trainings are computed elsewhere."""
-    with contextlib.suppress(ConfigError):  # which is raised later
+    """The value of `devices=`, if it is a number; 1 if other machines compute the trainings."""
+    with contextlib.suppress(ConfigError):  # the command raises it later
         values = compose.read(compose.expand(overrides)[0])
         is_here = values.get("machines", "local") == "local"
         count = str(values.get("devices", "")) if is_here else "1"
@@ -78,19 +79,19 @@ def _devices(overrides: Sequence[str]) -> int | None:
 
 @contextlib.contextmanager
 def messages() -> Iterator[None]:
-    """Within it, bad input and files that fail end the process with one message."""
+    """Ends the process with one message if its block meets bad input or a file that fails."""
     try:
         yield
     except ConfigError as error:
         fail(runtime.platform_error() or str(error), BAD_INPUT)
     except KeyboardInterrupt as stop:
         interrupted("Interrupted.", stop)
-    except BrokenPipeError:  # the reader has seen enough
+    except BrokenPipeError:  # the reader has closed the pipe
         leave(0)
     except FailedError as error:
         fail(str(error), FAILED)
     except OSError as error:
-        message = f"A file could not be written or read: {error}. What was written before is whole"
+        message = f"A file could not be written or read: {error}. Files written before are whole"
         fail(f"{message}; run the same command again to resume from there.", FAILED)
     except Exception as error:
         if message := runtime.platform_error():

@@ -1,16 +1,16 @@
-"""From the words that a user types to nested plain values: the first half of `runs.config`.
+"""Turns the words that a user types into nested plain values: the first half of `runs.config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts; `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
-every group (a word's, else the default of the task and the proxy), and lays three layers on each
-other: the choices, the preset or what a stored proxy was learned with, and the words. Names are
-checked later, when `runs.config` makes dataclasses of the layers.
+texts. `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
+every group: a word's, else the default of the task and the proxy. It merges three layers: the
+choices; over them the preset, or the settings that a stored proxy was learned with; over both the
+words. `runs.config` checks the names later, when it makes dataclasses of the layers.
 
 sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has
-values; values that hold with one agent, strategy or objective alone (`with_agent`, `with_es`,
-`with_objective`); and the section that it builds on (`like`), of its file or of `bases.yaml`.
-`general-<proxy>.yaml` serves tasks without a file of their own, and sections that say
-`like: general`. A user's file holds overrides.
+values, and more values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy
+or objective each. `like` names the section that it builds on, in its file or in `bases.yaml`.
+`general-<proxy>.yaml` serves tasks without a file of their own, and sections with `like: general`.
+A user's file holds overrides.
 """
 
 import contextlib
@@ -30,16 +30,16 @@ from sejax.ops.files import as_file_name
 from sejax.options import ConfigError, Options, listed, nearest, registry, require, shortened, told
 from sejax.options.plain import expanded, flatten, merge, split, unquoted
 
-# Choices where neither a word nor the task or the proxy makes one.
+# The choice of a group if no word, task or proxy makes it.
 DEFAULTS = {group: next(iter(x)) for group, x in registry.BUILT_IN.items() if group != "agent"}
-AGENTS = ("agent", "agents")  # the fields that choose them
+AGENTS = ("agent", "agents")  # the fields that choose agents
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
 # The text of sejax's own preset files, by their stems.
 FILES = sorted(Path(__file__).parents[1].glob("presets/*.yaml"))
 PRESETS = {path.stem: path.read_text(encoding="utf-8") for path in FILES}
-BASES, GENERAL = "bases", "general"  # what sections build on; presets of tasks without a file
+BASES, GENERAL = "bases", "general"  # files of sections to build on, and for tasks without a file
 # What reading a file of YAML may raise.
 UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
 Layers = dict[str, Mapping[str, Any]]
@@ -50,10 +50,10 @@ Config = TypeVar("Config", bound=Options)
 
 
 def words(overrides: Sequence[str]) -> dict[str, str]:
-    """Names and texts of the words of any command; of words with one name the last counts.
+    """Splits any command's words into names and texts; of words with one name the last counts.
 
     Raises:
-      ConfigError: for what is no word of this form, or several values.
+      ConfigError: for a word that is not of the form NAME=TEXT, or has several values.
 
     Example:
       >>> words(["env=acrobot", "agents=[ddqn,ppo]"])
@@ -79,7 +79,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def suggestion(overrides: Sequence[str]) -> str:
-    """What may be meant by words of which the first is no FIELD=VALUE."""
+    """What the user may mean by words whose first one is not FIELD=VALUE."""
     pattern = r"([-=\s]*)([^\s=]*)(?:[\s=]+([^\s=]+)(?!\S))?"
     dashes, name, value = re.findall(pattern, " ".join(overrides[:3]))[0]
     is_field = NAME.fullmatch(name) and not registry.is_registered("env", name)
@@ -90,7 +90,7 @@ def suggestion(overrides: Sequence[str]) -> str:
 
 
 def read(overrides: Sequence[str]) -> dict[str, Any]:
-    """Names and values of words, over those of the file that `preset=FILE.yaml` names.
+    """Names and values of words, laid over those in the file that `preset=FILE.yaml` names.
 
     Raises:
       ConfigError: as `words`, and for a file that cannot be read.
@@ -105,9 +105,9 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
         got = f"{shortened(path, 40)} ({told(error)})"
         must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
         raise ConfigError(must, "preset") from error
-    # An older run's config.yaml has null in the place of what it did not choose.
+    # An older run's config.yaml has both `agent` and `agents`; the unused one is null.
     of_file = {CHOICES.get(k, k): x for k, x in flat.items() if k not in AGENTS or x is not None}
-    if chosen := agents_of(values):  # in place of the file's
+    if chosen := agents_of(values):  # they replace the file's agents
         others = tuple(f"agents.{key}." for key in agents_of(of_file) if key not in chosen)
         of_file = {k: x for k, x in of_file.items() if k not in AGENTS and not k.startswith(others)}
     return of_file | values
@@ -132,14 +132,14 @@ def swept(
     folder_of: Callable[[Config, str], str],
     known: Collection[str] = (),
 ) -> list[Config]:
-    """The configuration of each run of a sweep, with folders of their own.
+    """The configuration of each run of a sweep; each run has its own folder.
 
     Args:
-      overrides: of the sweep.
+      overrides: the sweep's words.
       make: makes a configuration of a run's words.
-      field: that names the folder. If it is set, each run has a folder in it.
-      folder_of: the folder of a configuration otherwise, by a name of what is swept.
-      known: fields that tell default folders apart already.
+      field: the field that names the folder. If it is set, each run has a folder in it.
+      folder_of: else gives the folder, for a configuration and a name made of the swept words.
+      known: fields that default folders are already named by.
     """
     configs = []
     for of_run in expand(overrides):
@@ -159,19 +159,19 @@ def swept(
 
 
 def key_of(name: str) -> str:
-    """The key of an agent; `my_module_MyAgent` of `my_module:MyAgent`."""
+    """The key of an agent's name: `my_module_MyAgent` for `my_module:MyAgent`."""
     return re.sub(r"[^\w-]+", "_", name)
 
 
 def field_of(key: str, keys: Collection[str]) -> str:
-    """The name of an agent's fields in words and messages: `agent`, or `agents.KEY` of several."""
+    """The group of an agent's fields in words: `agent`, or `agents.KEY` if there are several."""
     return f"agents.{key}" if len(keys) > 1 else "agent"
 
 
 def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
-    """The names of agents by their keys; empty where none is chosen.
+    """The names of the chosen agents by their keys; empty if no word chooses one.
 
-    `agent=ddqn` and `agents=[ddqn,ppo]` choose them, and `agents.KEY.name=ddqn` by any key.
+    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents; `agents.KEY.name=ddqn` sets any key.
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in values]:
@@ -193,9 +193,9 @@ def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
 
 @functools.cache
 def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
-    """The presets of a task and proxy, by their names: its own, and what all tasks have.
+    """The presets of a task and proxy by name: those of its file, and those of all tasks.
 
-    What a section builds on is merged in. It stands before the section.
+    Each preset includes the section that it builds on. That section must stand before it.
     """
     sections: dict[str, dict[str, Any]] = {"best": {}}
     bases: dict[str, dict[str, Any]] = {}
@@ -216,9 +216,9 @@ def _of_preset(
     Args:
       values: by the names of words.
       chosen: the choice of each group.
-      names: of the agents by their keys. What a section says of other groups beside an agent holds
-        where that is the only one.
-      objective: where neither a word nor the preset chooses one.
+      names: of the agents by their keys. A section's `with_agent` may also set fields of other
+        groups; they count only if there is one agent.
+      objective: the objective if neither a word nor the preset chooses one.
 
     Raises:
       ConfigError: for an unknown preset, or one that the task does not have.
@@ -248,7 +248,7 @@ def _of_preset(
 
 
 def typed(overrides: Sequence[str]) -> frozenset[str]:
-    """What is typed, lists taken apart: each `module:attribute` in it may be imported."""
+    """The values of words, and the items of lists: each `module:attribute` may be imported."""
     texts = (override.partition("=")[2].strip("[]") for override in overrides)
     return frozenset(x.strip("[]'\" ") for text in texts for x in split(text))
 
@@ -264,24 +264,23 @@ def compose(
 
     Args:
       values: by the names of words; see `read`.
-      groups: of plugins whose choices are the command's fields.
-      learns: whether presets have settings.
-      stored: what a stored proxy was learned with, nested plain values.
+      groups: groups of plugins whose choices are fields of the command.
+      learns: whether the command learns proxies, so that presets apply.
+      stored: settings that a stored proxy was learned with, nested plain values.
       imports: each `module:attribute` that may be imported.
 
     Returns:
-      The layers in the order in which one lies on another, nested plain values by where they come
-      from.
+      The layers by their names, nested plain values; each lies over those before it.
 
     Raises:
-      ConfigError: for words that cannot be, and for a choice or a preset that is not there.
+      ConfigError: for bad words, and for an unknown choice or preset.
     """
     names = agents_of(values) or {key: x["name"] for key, x in stored.get("agents", {}).items()}
     if not names:
         default = agents.DEFAULTS[0]
         task = {name[4:]: x for name, x in values.items() if name.startswith("env.")}
         task["name"] = values.get("env", DEFAULTS["env"])
-        with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
+        with contextlib.suppress(ConfigError):  # making the task raises it again
             default = agents.default_for(envs.spec_of(registry.configure("env", task, imports)))
         names = {default: default}
     chosen: dict[str, Any] = {group: values.get(group, DEFAULTS[group]) for group in groups}
@@ -299,7 +298,7 @@ def compose(
 def _nested(
     values: Mapping[str, Any], keys: Collection[str], groups: Collection[str]
 ) -> dict[str, Any]:
-    """The words' values as a tree, those of `agent.FIELD` as the only agent's."""
+    """The words' values as a tree; `agent.FIELD` becomes a field of the only agent."""
     tree: dict[str, Any] = {}
     for name, value in values.items():
         if name in (*groups, *AGENTS):

@@ -1,8 +1,8 @@
 """A command's configuration: from the words that a user types to typed, validated dataclasses.
 
-A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` lays them on a
-preset, which gives nested plain values; `sejax.options.registry` makes dataclasses of those, each
-value read by its field's type; the dataclasses check themselves.
+A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` lays the words
+on a preset, which gives nested plain values. `sejax.options.registry` makes dataclasses of these
+values, and reads each value by its field's type. The dataclasses check themselves.
 """
 
 import dataclasses
@@ -67,12 +67,13 @@ class CommandConfig(Options):
 
     Attributes:
       groups: the groups of plugins whose choices are fields.
-      learns: whether proxies are learned: presets have settings, several agents have shares.
-      agents: by their keys, in the order of these; see `sejax.runs.compose.agents_of`.
+      learns: whether the command learns proxies: then presets apply, and several agents have
+        shares.
+      agents: configurations by key, in the keys' order; see `sejax.runs.compose.agents_of`.
       exploration: intrinsic reward of the agents
-      training: on proxies
-      num_parallel: Agents that train side by side on one device, on a CPU no more than are fastest;
-        null: what suits the agent and the device.
+      training: training on proxies
+      num_parallel: Agents that train side by side on one device; on a CPU at most the fastest
+        number. null: what suits the agent and the device.
       devices: null: all
     """
 
@@ -99,7 +100,7 @@ class CommandConfig(Options):
 
     @property
     def agent(self) -> Any:
-        """The agent's configuration, where it is one alone."""
+        """The configuration of the only agent."""
         (agent,) = self.agents.values()
         return agent
 
@@ -121,18 +122,19 @@ class CommandConfig(Options):
     ) -> None:
         """Checks that an agent learns something on a proxy.
 
-        Where episodes last to their limit, as those of one-step SEs and of most with soft ends, a
-        step budget must let it learn. What stops it must not read the proxy's returns.
+        Episodes of one-step SEs, and of most SEs with soft ends, last to their limit. On such a
+        proxy a step budget must be long enough for the agent to learn. The stop rule must not read
+        the proxy's returns.
 
         Args:
           key: of the agent.
-          group: of the fields of its training.
+          group: the group of its training's fields.
           training: how long it trains.
           proxy: the proxy's configuration.
           spec: of the real task.
 
         Raises:
-          ConfigError: if it does not.
+          ConfigError: if it would learn nothing.
         """
         longest, got = proxy.max_steps(spec.max_steps), training.solved_by
         require_reachable(group, training, longest)
@@ -158,9 +160,9 @@ class LearnConfig(CommandConfig):
       proxy: what is learned: a synthetic environment (se) or a reward network (rn)
       es: the evolution strategy of the outer loop
       objective: what the outer loop maximises
-      tracker: follows the run beside its files
+      tracker: another tool that follows the run, beside its files
       machines: where agents train
-      agent_hparams: default: the agent's; varied: learning rate, batch and network drawn anew for
+      agent_hparams: default: the agent's; varied: learning rate, batch and network are drawn for
         each training.
       generations: n_o: steps of the outer loop.
       num_seeds: Independent runs, with seeds seed, seed + 1, ...
@@ -208,7 +210,7 @@ class LearnConfig(CommandConfig):
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
-        """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
+        """The name of a group's choice; several agents are `ddqn+ppo`."""
         if group == "agent":
             return "+".join(self.agents)
         return registry.name_of(group, getattr(self, group))
@@ -218,7 +220,7 @@ class LearnConfig(CommandConfig):
         return envs.make_from(self.env)
 
     def parts(self) -> dict[str, Any]:
-        """The objects that it describes, as `sejax.make_learner` takes them."""
+        """The objects that the configuration describes: the arguments of `sejax.make_learner`."""
         task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
         learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
         names, weights = tuple(self.agents), self.weights
@@ -251,16 +253,16 @@ class EvaluateConfig(CommandConfig):
 
     Attributes:
       proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
-      env: the task, where proxy=real or the proxy's is your own
-      proxy_kind: my_module:MyProxy, where the proxy is one of your own
-      agent_hparams: as_learned: agents and exploration that the proxy was learned with, where no
-        agent is named; default: the agent's; varied: drawn around them for each agent.
-      training_from: How long agents train on the proxy. proxy: on an SE as it was learned with, on
-        a reward network as on the real task; config: as `training` says.
-      baseline: as many agents trained on the real task, beside them
-      out_dir: null: beside the proxy (runs/evaluate-<name> without a folder)
-      real_training: On the real task, and how all agents are tested unless training_from=config.
-        Agents as_learned keep the time_limit_is_terminal of the run.
+      env: the task, if proxy=real or if the proxy's task is your own
+      proxy_kind: my_module:MyProxy, if the proxy's class is your own
+      agent_hparams: as_learned: agents and exploration that the proxy was learned with, if no
+        agent is named; default: the agent's; varied: drawn around the default for each agent.
+      training_from: How long agents train on the proxy. proxy: on an SE as in the run that learned
+        it, on a reward network as on the real task; config: as `training` says.
+      baseline: whether as many agents train on the real task, for comparison
+      out_dir: null: beside the proxy (runs/evaluate-<name> if the proxy has no folder)
+      real_training: Training on the real task. Its test_episodes hold on the proxy too, unless
+        training_from=config. Agents as_learned keep the time_limit_is_terminal of the run.
     """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration",)
@@ -300,7 +302,7 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    # A stored proxy does not say who followed its run, or where it was computed.
+    # A proxy's file names neither the tracker of its run nor the machines.
     unsaid = {"tracker": {"name": "none"}, "machines": {"name": "local"}}
     return _from_plain(LearnConfig, merge(unsaid, header.UNSAID, values), imports)
 
@@ -308,8 +310,8 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
-    New fields have a default that changes no number. Of `module:attribute` only what `config` has
-    is imported.
+    The defaults of new fields change no number. A `module:attribute` is imported only if `config`
+    has it too.
     """
     try:
         return learn_config(stored, {*map(str, flatten(config.plain()).values())}).plain()
@@ -323,7 +325,7 @@ def _from_plain(
     """A command's configuration from nested plain values; see `learn_config`."""
     parts, fields = dict(values), fields_of(schema)
     by_key, only = parts.pop("agents", None) or {}, parts.pop("agent", None)
-    if only is not None:  # as an older file has it
+    if only is not None:  # the form of an older file
         by_key = {compose.key_of(str(dict(only).get("name"))): only, **by_key}
     is_map = isinstance(by_key, Mapping) and all(key == compose.key_of(str(key)) for key in by_key)
     message = f"must be agents by keys that are words; got {shortened(by_key)}. {FIX}"
@@ -372,12 +374,12 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 
 
 def evaluate_config(overrides: Sequence[str] = (), schema: Any = EvaluateConfig) -> Any:
-    """As `config`, for the words after `python -m sejax.evaluate` or, by `schema`, the like."""
+    """As `config`, for `python -m sejax.evaluate`, or for the command whose class is `schema`."""
     return _composed(schema, overrides)[0]
 
 
 def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, compose.Layers]:
-    """A command's configuration of its words, and the layers that it comes from."""
+    """The configuration that a command's words make, and its layers."""
     values, imports = compose.read(overrides), compose.typed(overrides)
     stored = {} if schema.learns else _learned(values)
     layers = compose.compose(values, schema.groups, schema.learns, stored, imports)
@@ -385,10 +387,10 @@ def _composed(schema: type[Schema], overrides: Sequence[str]) -> tuple[Schema, c
 
 
 def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
-    """What `--help` says of a command's fields beside these words.
+    """The text of `--help` for a command and these words.
 
-    The choices of each group, and the fields of these choices. A value that is no default has the
-    layer beside it that it comes from.
+    It lists the choices of each group, then the fields of the words' choices. If a value is not the
+    default, the layer that sets it stands beside it.
     """
     words = overrides if schema.learns else ["proxy=RUN_DIR", *overrides]
     config, layers = _composed(schema, words)
@@ -416,7 +418,7 @@ def help_text(schema: type[CommandConfig], overrides: Sequence[str]) -> str:
 
 
 def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, Any]:
-    """Plain values by the names of words, where an only agent is `agent`."""
+    """Plain values by the names of words; the fields of an only agent are `agent.FIELD`."""
     by_key = values.get("agents", {})
     rest = {name: x for name, x in values.items() if name != "agents"}
     of_agents = {"agents": by_key} if len(agents) > 1 else {"agent": by_key.get(*agents, {})}
@@ -424,7 +426,7 @@ def _as_words(values: Mapping[str, Any], agents: Collection[str]) -> dict[str, A
 
 
 def words_of(config: CommandConfig) -> dict[str, Any]:
-    """The value of each field, by its name in words; that of a choice is its name."""
+    """The value of each field by its name in words; the value of a choice is the plugin's name."""
     values = _as_words(config.plain(), config.agents)
     return values | {k.removesuffix(".name"): x for k, x in values.items() if k.endswith(".name")}
 
@@ -432,13 +434,13 @@ def words_of(config: CommandConfig) -> dict[str, Any]:
 def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     """What the agents of an evaluation take from the run that learned the proxy.
 
-    Words without an agent stand for all of the proxy's agents, with their exploration and with the
-    run's `time_limit_is_terminal`. An agent that a word names has the proxy's hyperparameters, if
-    the proxy was learned with that agent. A file without agents gets the task's default one.
+    If no word names an agent, all of the proxy's agents train, with their exploration and with the
+    run's `time_limit_is_terminal`. If a word names an agent that the proxy was learned with, the
+    agent has the proxy's hyperparameters. If the file has no agents, the task's default one trains.
 
     Raises:
-      ConfigError: with `agent_hparams=as_learned`, for agents beside it, or a file that does not
-        tell its agents.
+      ConfigError: with `agent_hparams=as_learned`, if words set agents or exploration, or if the
+        file does not tell its agents.
     """
     message = "must be given. Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
     require("proxy" in values, "proxy", message)
@@ -459,7 +461,7 @@ def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
         for agent in agents_there.values():
             header.configured("agent", agent, source)
         learned = {compose.key_of(key): agent for key, agent in agents_there.items()}
-    except ConfigError:  # of the proxy, which is said when it is loaded
+    except ConfigError:  # loading the proxy raises it later
         if hparams == "as_learned":
             raise
     if stored is None:

@@ -1,4 +1,4 @@
-"""The picture of a run."""
+"""The pictures of a run and of a check."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -64,7 +64,7 @@ def learning_curve(
 
 
 def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
-    """Draws what agents reached in each row of a check: a point for each, a bar for their mean.
+    """Draws the agents' returns in each row of a check: a point for each agent, a bar for the mean.
 
     Args:
       table: a data frame with the columns `world`, `agent` and `test_return`.

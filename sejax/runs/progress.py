@@ -1,4 +1,4 @@
-"""Lines of progress, and the last words of `sejax.run`."""
+"""Lines of progress, and the final message of `sejax.run`."""
 
 import time
 
@@ -11,7 +11,7 @@ from sejax.runs.trackers import FinishedGeneration
 
 
 class RunProgress:
-    """Prints a line for each generation; the first one where settings are not tuned for a task.
+    """Prints a line for each generation, and at the start a line if the task has no tuned settings.
 
     Args:
       config: of the run.
@@ -37,7 +37,7 @@ class RunProgress:
             print(text, flush=True)
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        """Prints the numbers of a generation; steps per second are the session's so far."""
+        """Prints the numbers of a generation; steps per second are the mean of this session."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values, agents = info.values, list(self._config.agents)
@@ -53,7 +53,7 @@ class RunProgress:
         self.say(text)
 
     def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
-        """Says how it ended, where everything is, and what to do next."""
+        """Says how the run ended, where its files are, and what to do next."""
         path, solved_score = directory.path, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
         verdict = f"best search mean {best:.1f}"
@@ -62,7 +62,7 @@ class RunProgress:
             verdict = f"{is_not}solved: {verdict}, solved at {solved_score:g}"
         elif bilevel.scoring.objective.meaning:
             verdict += f": {bilevel.scoring.objective.meaning}"
-        # What names plugins is typed: no name in a file is imported.
+        # The user must type the names of plugins: no name in a file is imported.
         agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
         env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
         named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
