@@ -1,8 +1,8 @@
-"""A run's folder, of which one file counts: `checkpoint.safetensors`.
+"""A run's folder, in which only `checkpoint.safetensors` counts.
 
-It holds the configuration, the state of the learner, and all rows of `metrics.csv`; see
-`sejax.runs.store`. All other files are remade from it when the run resumes. A run that is refused
-changes nothing.
+The checkpoint holds the configuration, the state of the learner, and all rows of `metrics.csv`; see
+`sejax.runs.store`. All other files are made again from it when the run resumes. A run that is
+refused changes nothing.
 """
 
 import secrets
@@ -27,40 +27,41 @@ COLUMNS = (
     *("best_so_far", "train_steps_mean", "train_steps_max", "train_episodes_mean"),
     *("num_nonfinite", "env_steps_total", "wall_s"),
 )
-# Columns that each agent of a mixture has too, with its name at the end.
+# Columns that a mixture also has for each agent, with the agent's name at the end.
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
-# Fields and groups that may change between two sessions: how long a run is, how it is computed.
+# Fields and groups that may change between two sessions: a run's length, and how it is computed.
 FREE_FIELDS = {"generations", "stop_when_solved", "checkpoint_every"}
 FREE_FIELDS |= {"devices", "run_dir", "tracker", "machines"}
 
 _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
-_STATE, _ROWS = "state", "metrics"  # of the checkpoint's tensors
-# Files whose temporaries a killed session leaves.
+_STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
+# A killed session may leave temporaries of these files.
 _WRITTEN = ("*.safetensors", _METRICS, _CONFIG, "learning_curve.png", "run.json")
-# Files that only a run leaves; without its checkpoint they come from an older sejax, or it is lost.
+# Files that only a run writes. Without a checkpoint an older sejax wrote them, or it was lost.
 _SIGNS_OF_A_RUN = (_METRICS, "proxy.safetensors", "checkpoint")
 State = TypeVar("State")
 
 
 class RunDirectory(Store):
-    """One run's folder, which this process alone uses within `with`.
+    """One run's folder, which only this process may use within `with`.
 
     Call `restore` once, then `save` after each block of generations.
 
-    What it stores is compared as plain values: nothing that only the folder names is imported.
+    The stored configuration is compared as plain values: if only the folder names a module, it is
+    not imported.
 
     Args:
       config: of the run.
       field: the field that names the folder, for messages.
 
     Attributes:
-      path: the folder; made, or that of an earlier session of the same run.
+      path: the folder: new, or from an earlier session of the same run.
       config: the configuration, plain values in nested mappings.
-      columns: of `metrics.csv`: with several agents, four more for each of them.
-      rows: the rows of `metrics.csv`, each as text by column: the generations that are saved.
+      columns: the columns of `metrics.csv`; several agents have four more each.
+      rows: the rows of `metrics.csv`, one for each saved generation, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
-      versions: of the packages that decide the numbers, as the checkpoint was written.
+      versions: of the packages that decide the numbers, from the time of the checkpoint.
     """
 
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
@@ -81,7 +82,7 @@ class RunDirectory(Store):
         self._tensors: dict[str, np.ndarray] | None = None
 
     def __enter__(self) -> Self:
-        """Takes the folder, and reads what the checkpoint holds, if there is one.
+        """Locks the folder, and reads the checkpoint if there is one.
 
         Raises:
           ConfigError: if the folder holds another run or a damaged one, is in use by another
@@ -96,11 +97,11 @@ class RunDirectory(Store):
         return self
 
     def last(self, column: str) -> str:
-        """The value in the last row that is saved; 0 without one."""
+        """A column's value in the last saved row; 0 if there is none."""
         return self.rows[-1][column] if self.rows else "0"
 
     def restore(self, like: State) -> State | None:
-        """The state of the checkpoint, and the files beside it remade; None for a new run.
+        """Returns the checkpoint's state, and makes its files again; None for a new run.
 
         Args:
           like: a state of the run, or its shapes.
@@ -122,7 +123,7 @@ class RunDirectory(Store):
     def save(
         self, state: PyTree[Array], info: GenerationInfo, wall_s: float, cpu_s: float
     ) -> list[dict[str, str]]:
-        """Writes the checkpoint after a block of generations, then the files remade from it.
+        """Writes the checkpoint after a block of generations, then the files made from it.
 
         Args:
           state: pytree of arrays.
@@ -135,8 +136,7 @@ class RunDirectory(Store):
           The new rows.
 
         Raises:
-          OSError: if a file cannot be written; the checkpoint is then whole, this one or the one
-            before.
+          OSError: if a file cannot be written; the new or the previous checkpoint is then whole.
         """
         new = self._rows_of(info, wall_s)
         csv, is_first = self._as_csv([*self.rows, *new]), not self.rows
@@ -152,14 +152,14 @@ class RunDirectory(Store):
         return new
 
     def _as_csv(self, rows: Iterable[Mapping[str, str]]) -> str:
-        """The text of `metrics.csv`, none of whose cells has a comma."""
+        """The text of `metrics.csv`; no cell has a comma."""
         cells = [self.columns, *(row.values() for row in rows)]
         return "".join(",".join(row) + "\n" for row in cells)
 
     def _open(self) -> None:
-        """Takes over what the checkpoint holds, if there is one."""
+        """Reads the checkpoint, if there is one."""
         entry = self.get(_CHECKPOINT)
-        if entry is None:  # then neither a run without its checkpoint, nor one of an older sejax
+        if entry is None:  # then the folder must hold no run, also none of an older sejax
             for name in filter(lambda name: (self.path / name).exists(), _SIGNS_OF_A_RUN):
                 must = "must be new or hold the checkpoint of its run"
                 raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
@@ -168,7 +168,7 @@ class RunDirectory(Store):
         try:
             header, *lines = tensors.pop(_ROWS).tobytes().decode().splitlines()
             rows = [dict(zip(header.split(","), x.split(","), strict=True)) for x in lines]
-            # A column that an older version did not write is nan.
+            # A column is nan if an older version did not write it.
             self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
             self.id, self.cpu_s = str(values["id"]), float(values["cpu_s"])
             self.versions = values.get("versions", self.versions)
@@ -194,7 +194,7 @@ class RunDirectory(Store):
         return [{name: row[name] for name in self.columns} for row in cells]
 
     def _remake(self) -> None:
-        """Writes the text files that are not as the checkpoint has them."""
+        """Writes the text files that differ from the checkpoint."""
         remove_leftovers(self.path, _WRITTEN)
         config = yaml.safe_dump(self.config, sort_keys=False)
         for name, text in ((_CONFIG, config), (_METRICS, self._as_csv(self.rows))):
@@ -212,14 +212,14 @@ def _as_text(value: np.generic) -> str:
 
 
 def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
-    """A pytree of stored leaves, each of its own memory and tied to no device.
+    """A pytree of stored leaves; each has its own memory and is tied to no device.
 
     Args:
       tensors: leaves by path.
       like: a pytree of the same structure; its shapes are enough.
 
     Raises:
-      ValueError: if the structure is another one.
+      ValueError: if the structure, a shape or a dtype differs.
     """
     leaves = _named(like)
     there, here = _shapes(tensors), _shapes(jax.eval_shape(_bare, leaves))
@@ -245,7 +245,7 @@ def _is_key(leaf: Array) -> bool:
 
 
 def _bare(leaves: dict[str, Array]) -> dict[str, Array]:
-    """PRNG keys as their data."""
+    """The leaves, with PRNG keys as their data."""
     return {name: jax.random.key_data(x) if _is_key(x) else x for name, x in leaves.items()}
 
 

@@ -18,7 +18,7 @@ _NEVER_SECONDS = 1_000_000
 
 
 def available_cores() -> int:
-    """CPU cores that this process may use: those it may run on, or fewer of a container's quota."""
+    """CPU cores that this process may use: its affinity, or a container's quota if it is less."""
     is_affine = hasattr(os, "sched_getaffinity")
     cores: float = len(os.sched_getaffinity(0)) if is_affine else os.cpu_count() or 1
     with contextlib.suppress(OSError, ValueError):
@@ -28,7 +28,7 @@ def available_cores() -> int:
 
 
 def platform_error() -> str:
-    """The message for a `JAX_PLATFORMS` that jax lacks, of which other code fails; else empty."""
+    """The message if jax lacks `JAX_PLATFORMS`, which makes other code fail; else empty."""
     if platforms := os.environ.get("JAX_PLATFORMS"):
         try:
             jax.devices()
@@ -41,8 +41,8 @@ def platform_error() -> str:
 def configure_xla(num_devices: int | None = None) -> None:
     """Sets XLA up for one CPU device per core; without effect once jax has computed.
 
-    A flag that the user has set in `XLA_FLAGS` stays. The time limits of collectives are lifted:
-    devices reach the gather at the end of a generation at very different times, and XLA would
+    A flag that the user has set in `XLA_FLAGS` stays. The time limits of collectives are lifted.
+    Devices reach the gather at the end of a generation at very different times, and XLA would
     abort the process after a minute of waiting.
 
     Args:
@@ -59,20 +59,20 @@ def configure_xla(num_devices: int | None = None) -> None:
     added = [f"{flag}={value}" for flag, value in flags.items() if flag not in users]
     os.environ["XLA_FLAGS"] = " ".join([users, *added]).strip()
     if count == 1:
-        # With one device XLA would hand pieces of the step to a second thread, which doubles the
-        # CPU time for no gain: the pieces are smaller than the handing over.
+        # With one device XLA would hand pieces of the step to a second thread. That doubles the
+        # CPU time for no gain: handing a piece over takes longer than computing it.
         os.environ.setdefault("NPROC", "1")
 
 
 def configure_jax() -> None:
-    """What the commands ask of jax; what the user has set stays.
+    """Sets jax up for the commands; settings of the user stay.
 
-    Matrices are multiplied in single precision on GPUs too, as on CPUs and in `sejax.gym`: recent
-    ones round factors to ten bits otherwise, and a proxy is another one there.
+    Matrices are multiplied in single precision on GPUs too, as on CPUs and in `sejax.gym`. By
+    default recent GPUs round factors to ten bits, which makes a proxy another one there.
 
-    Compiled programs are kept between runs, in a folder for this kind of CPU: code compiled for
-    another one is rejected or unsafe, so that the folder's name depends on the CPU's model and
-    features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
+    Compiled programs are kept between runs. Code compiled for another kind of CPU is rejected or
+    unsafe, so the folder's name depends on the CPU's model and features. `SEJAX_CACHE_DIR` moves
+    the folder; set to nothing, it switches the cache off.
 
     Raises:
       ConfigError: if jax computes in 64 bits.
@@ -95,5 +95,5 @@ def configure_jax() -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that decide a run's numbers."""
+    """Versions of the packages that decide a run's numbers."""
     return {"sejax": sejax.__version__, "jax": version("jax"), "jaxlib": version("jaxlib")}

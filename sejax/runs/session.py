@@ -41,14 +41,14 @@ def run(
       config: the configuration.
       directory: its folder.
       chunks: the generations of this configuration.
-      report: is told of each generation; None: nobody is told.
+      report: prints each generation; None: nothing is printed.
 
     Returns:
-      What `run.json` holds. `ended` is finished, solved, or diverged: a run stops, without a proxy,
-      when all of its agents have diverged.
+      The content of `run.json`. `ended` is finished, solved, or diverged. If all agents of a run
+      have diverged, it stops and writes no proxy.
 
     Raises:
-      ConfigError: if the folder's state is that of another version.
+      ConfigError: if another version wrote the folder's state.
       OSError: if a file cannot be written; everything saved before is whole.
     """
     report, bilevel = report or RunProgress(config, is_quiet=True), chunks.bilevel
@@ -102,7 +102,7 @@ def run(
 
 
 def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:
-    """A new state or that of the folder, beside which the proxies are written again."""
+    """The folder's state, whose proxies are written again; a new state if there is none."""
     state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
     if restored is not None:
@@ -114,7 +114,7 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgre
         solved = jax.numpy.bool_(chunks.bilevel.is_solved(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
         save_proxies(directory, chunks.bilevel, jax.device_get(state), 0)
-    # Buffers of its own, so that they can be donated.
+    # A copy has its own buffers, which can be donated.
     return jax.tree.map(lambda x: x.copy(), state)
 
 
@@ -128,25 +128,25 @@ def _advance(
         report.status("first generation")
     state, info = chunks.advance(state, length)
     pending: Any = state.generation
-    while not pending.is_ready():  # Ctrl-C is heard in Python alone
+    while not pending.is_ready():  # only Python code hears Ctrl-C
         time.sleep(0.02)
     return state, info
 
 
 def _all_diverged(directory: RunDirectory, bilevel: Bilevel) -> bool:
-    """Whether there are generations, and every agent of each met a number that is not finite."""
+    """Whether every agent of every generation has diverged; False before the first generation."""
     rows, agents = directory.rows, bilevel.strategy.num_evaluations
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Ctrl-C and SIGTERM are heard at the end of the block.
+    """Holds Ctrl-C and SIGTERM back until the end of the block.
 
-    Within, files are being written, and jax's caches call back from weak references, where Python
-    prints an exception and forgets it: the run would go on.
+    The block writes files. jax's caches also call back from weak references in it, where Python
+    prints an exception and drops it: the run would go on.
     """
-    is_main = threading.current_thread() is threading.main_thread()  # others hear no signals
+    is_main = threading.current_thread() is threading.main_thread()  # others get no signals
     heard: list[int] = []
     handlers = {
         number: signal.signal(number, lambda number, frame: heard.append(number))
@@ -165,13 +165,13 @@ def interrupts_held() -> Iterator[None]:
 def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, first: int) -> None:
     """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
-    Where the search mean has diverged, the file before it stays.
+    If the search mean is not finite, the previous file stays.
 
     Args:
       directory: of the run.
       bilevel: the functions of Algorithm 1.
-      state: after the last generation that is saved, on the host.
-      first: the first generation of which no proxy is written yet.
+      state: the state after the last saved generation, on the host.
+      first: the first generation without a written proxy.
 
     Raises:
       OSError: if a file cannot be written.
@@ -182,7 +182,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
     first_agent, names = bilevel.scoring.mixture.agents[0], bilevel.scoring.mixture.names
     discount = first_agent.discount(first_agent.hparams)
-    # What was learned does not depend on the tracker, nor on where it was computed.
+    # A proxy does not depend on the tracker, nor on the machines.
     config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
     for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
         path = directory.path / f"{name}.safetensors"
@@ -211,7 +211,7 @@ def draw(config: LearnConfig, directory: RunDirectory, bilevel: Bilevel) -> None
 
 
 def _finished(rows: list[dict[str, str]], info: GenerationInfo) -> Iterator[FinishedGeneration]:
-    """The generations of a chunk for the callbacks, of its rows and its info on the host."""
+    """A chunk's generations for the callbacks, made from its rows and its info on the host."""
     for i, row in enumerate(rows):
         scores = np.asarray(info.population_scores[i])
         yield FinishedGeneration(

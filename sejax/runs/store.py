@@ -1,8 +1,8 @@
-"""What a computation keeps in a folder to go on after a kill, and only with the same settings.
+"""A folder of results, with which a computation of the same settings goes on after a kill.
 
 Each entry is one file, `NAME.safetensors`, with a checksum and the settings that it was made with.
-It is written to a temporary file, put on the disk, and renamed over the one before: a kill at any
-moment leaves a whole entry, this one or the one before.
+It is written to a temporary file, put on the disk, and renamed over the previous entry. So a kill
+at any moment leaves a whole entry, the new or the previous one.
 """
 
 import json
@@ -20,21 +20,21 @@ from sejax.options.plain import differences
 
 Tensors: TypeAlias = Mapping[str, np.ndarray]  # by name
 KIND, FORMAT_VERSION = "sejax_run", 1  # of the files, since the first release
-LOCK = "sejax.lock"  # the file that says that a process uses the folder
+LOCK = "sejax.lock"  # the file that a process locks while it uses the folder
 
 
 class Store:
-    """Entries of the same settings in a folder; within `with`, this process alone uses it.
+    """Entries of the same settings in a folder; within `with`, only this process may use it.
 
     Args:
       folder: the folder, made with the first entry or lock.
       settings: plain values in nested mappings, on which all entries depend.
       field: the field that names the folder, for messages.
-      free: groups and fields of the first level that may differ: how to compute, not what.
-      completed: adds to stored settings the fields that an older version did not write.
+      free: groups and fields of the first level that may differ: they say how to compute, not what.
+      completed: adds the fields that an older version did not write to stored settings.
 
     Attributes:
-      settings: as they are stored, with lists in the place of tuples.
+      settings: the settings as they are stored, with lists for tuples.
 
     Example:
       >>> import tempfile
@@ -65,7 +65,7 @@ class Store:
         self._is_used = False
 
     def __enter__(self) -> Self:
-        """Makes the folder and locks it; the lock ends with the process, however that ends.
+        """Makes the folder and locks it; the lock ends with the process, even if it is killed.
 
         Raises:
           ConfigError: if another process uses it, or it cannot be written.
@@ -82,7 +82,7 @@ class Store:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Lets other processes use the folder; leaves nothing behind if it has no entry."""
+        """Unlocks the folder; if it has no entry, removes what `with` has made."""
         if self._lock.is_locked and not self._is_used:
             (self.folder / LOCK).unlink(missing_ok=True)
             remove_empty(self._new_folders)
@@ -93,7 +93,7 @@ class Store:
         return self.folder / f"{name}.safetensors"
 
     def get(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """The tensors of an entry, and its plain values; None if there is none of this name.
+        """An entry's tensors and plain values; None if there is no entry of this name.
 
         Raises:
           ConfigError: if it is damaged, or was made with other settings.
@@ -112,12 +112,12 @@ class Store:
         if differing:
             differing = differences(self._completed(stored), self.settings, self._free, most=2)
         if differing:
-            must = "must be new or hold what was made with the same settings"
+            must = "must be new or made with the same settings"
             raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
         return tensors, values
 
     def put(self, name: str, tensors: Tensors | None = None, **values: object) -> None:
-        """Writes an entry over the one of this name.
+        """Writes an entry over the previous one of this name.
 
         Args:
           name: of the entry.
@@ -125,8 +125,8 @@ class Store:
           **values: plain values.
 
         Raises:
-          OSError: if it cannot be written, or the folder was removed since it was locked; the entry
-            before is then whole.
+          OSError: if it cannot be written, or the folder was removed since it was locked; the
+            previous entry is then whole.
         """
         if self._lock.is_locked and not (self.folder / LOCK).exists():
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
@@ -135,7 +135,7 @@ class Store:
         self._is_used = True
 
     def once(self, name: str, compute: Callable[[], Tensors]) -> dict[str, np.ndarray]:
-        """The tensors of an entry, which are computed and written unless it is there.
+        """The tensors of an entry; computes and writes them if there is none.
 
         Raises:
           ConfigError: as `get`.
@@ -148,7 +148,7 @@ class Store:
         return tensors
 
     def damaged(self, name: str, error: Exception) -> ConfigError:
-        """The error for an entry that cannot be read, and why."""
+        """The error for an entry that cannot be read, with the reason."""
         self._is_used = True
         return self.refused(f"must hold whole files; got {self.file(name)}: {error}")
 

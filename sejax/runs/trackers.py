@@ -1,7 +1,7 @@
-"""Following a run with other tools: TensorBoard, or one of your own.
+"""Trackers: tools that follow a run, such as TensorBoard or one of your own.
 
-A tracker hears of each generation after the run directory has it. It adds nothing to a run and
-cannot stop it.
+A tracker hears of each generation after the run directory has saved it. It adds nothing to a run
+and cannot stop it.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,7 +23,7 @@ class TrackedRun:
 
     Attributes:
       folder: the run directory; at the end it holds `learning_curve.png`.
-      id: 8 hexadecimal digits, the same when the run goes on.
+      id: 8 hexadecimal digits, the same in all sessions of the run.
       generation: the first generation that the tracker will hear of; 0 for a new run.
       config: the configuration, plain values in nested mappings.
     """
@@ -41,12 +41,12 @@ class TrackedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedGeneration:
-    """A generation as the callbacks of a run hear of it.
+    """What the callbacks of a run hear of a generation.
 
     Attributes:
       generation: its number, from 0 on.
       values: the columns of `metrics.csv`.
-      scores: scores of the population's evaluations that are finite, `[evaluation]`.
+      scores: the finite scores of the population's evaluations, `[evaluation]`.
       train_steps: steps of all trainings.
     """
 
@@ -58,7 +58,7 @@ class FinishedGeneration:
 
 @runtime_checkable
 class Tracker(Protocol):
-    """The methods of a tracker, which its configuration makes by `make(run: TrackedRun)`."""
+    """The methods of a tracker; its configuration makes it with `make(run: TrackedRun)`."""
 
     def on_generation(self, info: FinishedGeneration) -> None:
         """Hears of a generation; each comes in order, and once a session."""
@@ -68,7 +68,7 @@ class Tracker(Protocol):
 
 
 class GuardedTracker:
-    """The tracker of a run, made at its first generation, dropped with one message if it raises."""
+    """A run's tracker: made at the first generation, dropped with one message if it raises."""
 
     def __init__(self, config: Makes[Tracker], run: TrackedRun, say: Callable[[str], None]):
         """The tracker of a configuration; `say` takes the message."""
@@ -112,8 +112,8 @@ class TensorBoardConfig:
     def make(self, run: TrackedRun) -> Tracker:
         from tensorboardX import SummaryWriter
 
-        # Later generations of a killed session are purged. The suffix keeps its file from being
-        # replaced by one that begins in the same second.
+        # Later generations of a killed session are purged. The suffix keeps that session's file
+        # from being replaced by a file that begins in the same second.
         folder, suffix = str(run.folder / "tensorboard"), f".{run.generation}"
         writer = SummaryWriter(folder, purge_step=run.generation, filename_suffix=suffix)
         text = yaml.safe_dump(run.config, sort_keys=False)

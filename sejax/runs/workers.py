@@ -1,10 +1,10 @@
-"""The generations of a run, compiled; and `machines=`: whether workers compute the trainings.
+"""A run's compiled generations; and `machines=`: whether workers compute the trainings.
 
-With `machines=ray` the driver, this process, keeps the strategy, its state and all files. In each
-generation it sends candidates to workers on a Ray cluster, in shares, and outcomes come back. An
-outcome depends on its key and its candidate alone, so that the numbers are those of a single
-process whichever worker computes it. A share is a task of Ray: Ray starts workers where cores are
-free, also on machines that join, and sends a share again whose worker died.
+With `machines=ray` this process, the driver, keeps the strategy, its state and all files. In each
+generation it sends shares of the candidates to workers on a Ray cluster, which return outcomes. An
+outcome depends only on its key and its candidate. So the numbers are those of a single process,
+whichever worker computes an outcome. A share is a task of Ray. Ray starts workers where cores are
+free, also on machines that join later, and sends a share again if its worker dies.
 """
 
 import contextlib
@@ -35,22 +35,22 @@ from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
-Portion: TypeAlias = tuple[int, Trainings]  # of an agent, by its index; keys as data
-BATCH = 16  # trainings in a share, where neither the agent nor the user says how many
+Portion: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
+BATCH = 16  # trainings in a share if neither the agent nor the user says how many
 Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
-RETRIES = 20  # by Ray, of a share whose worker dies
+RETRIES = 20  # how often Ray sends a share again whose worker died
 LOOK_S = 1.0  # seconds between checks that the cluster still answers
 
 
 class Chunks:
-    """The generations of Algorithm 1 in chunks, each length compiled once, ahead of time.
+    """Chunks of generations of Algorithm 1; each length is compiled once, ahead of time.
 
-    `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
-    the chunk before returned it.
+    `jax.jit` would compile again for a new state, a restored one, and one that a chunk returned,
+    because their placements differ.
 
     Attributes:
       bilevel: the functions of Algorithm 1.
-      cpu_s: CPU seconds of other processes than this one.
+      cpu_s: CPU seconds of other processes.
       compiled: the programs of chunks, by their lengths.
     """
 
@@ -83,7 +83,7 @@ class Chunks:
 
 
 def make_chunks(config: LearnConfig) -> Chunks:
-    """The generations of a configuration, for all runs that differ from it in the seed."""
+    """The generations of a configuration; runs that differ in the seed may share them."""
     return Chunks(make_bilevel(**config.parts()))
 
 
@@ -110,8 +110,7 @@ class RayConfig(Options):
     """Worker processes on a Ray cluster, each on a CPU core.
 
     Attributes:
-      address: HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or
-        local
+      address: HOST:PORT of the cluster; local: one on this machine; null: RAY_ADDRESS, or local
       workers: worker processes; null: one for each CPU core of the cluster
     """
 
@@ -129,8 +128,8 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        # What a worker must know: a text, by which it keeps what it has compiled.
-        idle = "tracker", "machines"  # which it need not have
+        # A worker needs this text, and keeps its compiled programs by it.
+        idle = "tracker", "machines"  # a worker need not have their packages
         setup = json.dumps({name: x for name, x in config.plain().items() if name not in idle})
         with self.pool() as pool:
             yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
@@ -148,7 +147,7 @@ class RayConfig(Options):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         quiet = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
         try:
-            with warnings.catch_warnings():  # Ray's processes do not go on with jax
+            with warnings.catch_warnings():  # the processes that Ray forks do not use jax
                 warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
@@ -166,26 +165,26 @@ class RayConfig(Options):
 
 
 def share_sizes(bilevel: Bilevel, num_parallel: int | None) -> list[int]:
-    """Trainings of each agent in a share, which is one batch.
+    """The number of trainings in a share, which is one batch, for each agent.
 
-    They are the same for any number of workers, because sums over batches of other widths round
+    It does not depend on the number of workers, because sums over batches of other widths round
     otherwise.
     """
     return [num_parallel or width or BATCH for width in bilevel.evaluate.widths]
 
 
 class RemoteChunks(Chunks):
-    """Generations whose trainings are sent to workers.
+    """Generations whose trainings are computed by workers.
 
-    `ask` and `tell` stay here. The state after a generation equals that of `Bilevel.generation` to
-    the last bit, if the workers' CPUs are of this one's kind.
+    This process computes `ask` and `tell`. The state after a generation equals that of
+    `Bilevel.generation` to the last bit, if the workers have the same kind of CPU.
 
     Args:
       config: of the run.
-      compute: what `score` returns for each share, in their order.
+      compute: gives what `score` returns for each share, in the order of the shares.
 
     Attributes:
-      cpu_s: CPU seconds of the workers in trainings.
+      cpu_s: CPU seconds that the workers spent on trainings.
     """
 
     def __init__(
@@ -198,15 +197,15 @@ class RemoteChunks(Chunks):
         self._sizes = share_sizes(self.bilevel, config.num_parallel)
 
     def compile(self, length: int) -> None:
-        """Compiles `ask` and `tell`, of which chunks of any length are made."""
+        """Compiles `ask` and `tell`, which serve chunks of any length."""
         self.compiled[length] = self._programs
 
     @functools.cached_property
     def _programs(self) -> tuple[Any, list[Outcome]]:
-        """The program of `ask` and `tell`, and the outcomes with which it asks.
+        """The program of `ask` and `tell`, and the outcomes that it is given to ask.
 
-        Both are one program that runs twice in a generation: in a program of its own XLA would
-        round the candidates of `ask` otherwise than in `Bilevel.generation`.
+        One program does both, and runs twice in a generation. In a program of `ask` alone, XLA
+        would round the candidates otherwise than in `Bilevel.generation`.
         """
         bilevel = self.bilevel
 
@@ -263,7 +262,7 @@ class RemoteChunks(Chunks):
 
 
 def num_workers(machines: RayConfig) -> int:
-    """The workers that are asked for, or that the cluster's machines have room for now.
+    """The number of workers: the user's, or one for each CPU core that the cluster has now.
 
     Raises:
       FailedError: if the cluster is gone: Ray itself would wait for ever.
@@ -281,7 +280,7 @@ def num_workers(machines: RayConfig) -> int:
 def _on_cluster(
     machines: RayConfig, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]
 ) -> list[Any]:
-    """What a function returns for each tuple of arguments, as many at a time as there are workers.
+    """A function's results for tuples of arguments; as many calls at a time as there are workers.
 
     Raises:
       FailedError: if a worker raises an error or dies again and again, or the cluster is lost.
@@ -296,7 +295,7 @@ def _on_cluster(
         while len(running) >= (most if i < len(items) else 1):
             done, running = ray.wait(running, timeout=LOOK_S)
             if not done:
-                num_workers(machines)  # which raises if there is no cluster any more
+                num_workers(machines)  # raises if the cluster is gone
     try:
         results: list[Any] = ray.get(tasks)
     except ray.exceptions.RayError as error:  # its last line is what the worker raised
@@ -314,7 +313,7 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
     """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
     (agent_index, trainings), started = share, time.process_time()
     size, program = _programs(setup)[agent_index]
-    # Filled up with copies, for which nothing is computed.
+    # Copies fill the share up; nothing is computed for them.
     n, numbers = len(trainings.active), np.arange(size)
     trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
     outcome = program(dataclasses.replace(trainings, active=trainings.active & (numbers < n)))
@@ -324,8 +323,8 @@ def score(setup: str, share: Portion) -> tuple[Outcome, float]:
 
 @functools.lru_cache(maxsize=1)
 def _programs(setup: str) -> list[tuple[int, Any]]:
-    """The size of a share, and the program that computes one, for each agent of a run."""
-    # Who started the run has typed the names of its plugins.
+    """For each agent of a run: the size of a share, and the program that computes a share."""
+    # Whoever started the run has typed the names of its plugins, so all may be imported.
     config = configuration.learn_config(json.loads(setup), imports=None)
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
@@ -344,21 +343,21 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
 
 
 def call(versions: dict[str, str], function: Callable[..., Any], item: tuple[Any, ...]) -> Any:
-    """What a function returns on a worker for a tuple of arguments.
+    """Calls a function on a worker with a tuple of arguments.
 
     Raises:
-      ConfigError: if this machine has other versions of what decides the numbers.
+      ConfigError: if this machine has other versions of the packages that decide the numbers.
     """
     _use_one_core()
     if (here := runtime.versions()) != versions:
         got = f"{here} on {socket.gethostname()} and {versions} here"
         must = f"machines must have the same versions everywhere; got {got}"
-        raise ConfigError(f"{must}. Set the same versions up there.", "machines")
+        raise ConfigError(f"{must}. Install the same versions there.", "machines")
     runtime.configure_jax()
     return function(*item)
 
 
 def _use_one_core() -> None:
-    """Keeps this process on one CPU core, whatever else there is; before jax first computes."""
+    """Keeps this process on one CPU core, without a GPU; call it before jax first computes."""
     runtime.configure_xla(1)
     jax.config.update("jax_platforms", "cpu")
