@@ -1,8 +1,8 @@
 """Options: the fields of a configuration, their checks, and the errors that bad input raises.
 
-A configuration is a frozen dataclass that can make what it configures. Each of its fields is
-written once: name, type with its bounds, default. Pydantic checks and converts a value. What the
-docstring says of a field under `Attributes:` is the text of `--help`.
+A configuration is a frozen dataclass that can make an object. Each of its fields is written once:
+name, type with its bounds, default. Pydantic checks and converts its value. The docstring's texts
+under `Attributes:` are the texts of `--help`.
 
 Every message has one form: the field, what must hold, what came, and how to fix it.
 
@@ -41,7 +41,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeGuard
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
-MOST = 1e30  # of numbers that programs compute with in 32 bits
+MOST = 1e30  # the largest number for programs that compute in 32 bits
 
 
 # --- errors --------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ class ConfigError(ValueError):
     """Input that cannot work. Commands print its message and exit with status 2.
 
     Attributes:
-      field: the field or group at fault, such as `agent.batch_size`; empty where it is none.
+      field: the field or group at fault, such as `agent.batch_size`; empty if there is none.
     """
 
     def __init__(self, message: str, field: str = ""):
@@ -60,12 +60,12 @@ class ConfigError(ValueError):
 
 
 class FailedError(RuntimeError):
-    """Computing that cannot go on. Commands print its message and exit with status 1."""
+    """A computation that cannot go on. Commands print its message and exit with status 1."""
 
 
 @contextlib.contextmanager
 def errors_of(group: str, where: str) -> Iterator[None]:
-    """Errors about a group in here name the place where it stands, as `agents.ddqn` for `agent`."""
+    """Errors in the block name a group by the place where it stands: `agents.ddqn` for `agent`."""
     try:
         yield
     except ConfigError as error:
@@ -79,7 +79,7 @@ def require(holds: object, field: str, message: str) -> None:
     """Raises `ConfigError` unless `holds`.
 
     Args:
-      holds: what must be so.
+      holds: what must be true.
       field: the field at fault.
       message: follows the field: what must hold, `; got` what came, and how to fix it.
     """
@@ -88,7 +88,7 @@ def require(holds: object, field: str, message: str) -> None:
 
 
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
-    """Error for an unknown choice; lists known ones, nearest first, and names the override."""
+    """The error for an unknown choice; it lists known names, nearest first, and an override."""
     ranked = nearest(got, known)
     message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
     return ConfigError(f"{message} Did you mean {field}={ranked[0]}?", field)
@@ -116,7 +116,7 @@ def told(error: BaseException) -> str:
     """An error of other code on one line: its kind, its message, its place in a user's file."""
     line, text = place_of(error), shortened(" ".join(str(error).split()), 120)
     classes = [cls.__name__ for cls in type(error).__mro__]
-    # jax's errors of a value that is not known while tracing; their texts tell of jax's inside.
+    # jax's errors for a value that is unknown while tracing; their texts describe jax's internals.
     if any(name.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for name in classes):
         text = "Python code needs the value of a traced array; use jnp.where, or jax.numpy"
     return f"{classes[0]}: {text}{f' ({line})' if line else ''}"
@@ -132,7 +132,7 @@ def place_of(error: BaseException) -> str:
     if not users:
         return ""
     path = Path(users[-1].filename)
-    with contextlib.suppress(OSError, ValueError):  # it is elsewhere
+    with contextlib.suppress(OSError, ValueError):  # the file is outside of the current folder
         path = path.relative_to(Path.cwd())
     return f"{path}:{users[-1].lineno}: {shortened(users[-1].line, 60)}"
 
@@ -169,14 +169,14 @@ Activation = Literal["tanh", "fast_tanh", "relu", "leaky_relu", "prelu"]
 def option(
     default: Any, *, traced: bool = False, varied: str | None = None, names_code: bool = False
 ) -> Any:
-    """A dataclass field that is marked.
+    """A dataclass field with marks.
 
     Args:
       default: its default.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
-      names_code: whether its text may be a `module:attribute`, which no file may name.
+      names_code: whether its text may be a `module:attribute`, which the user must type.
     """
     metadata = {"traced": traced, "varied": varied, "names_code": names_code}
     return dataclasses.field(default=default, metadata=metadata)
@@ -186,15 +186,15 @@ def option(
 class Options:
     """A dataclass whose fields are checked by their types, such as `Count`.
 
-    `group` is where the command line has them.
+    `group` is the first part of the fields' names on the command line.
     """
 
     group: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """Checks and converts all fields: numbers of NumPy and jax become Python's.
+        """Checks and converts all fields.
 
-        So equal configurations are the same program.
+        Numbers of NumPy and jax become Python's, so that equal configurations give one program.
 
         Raises:
           ConfigError: for the first value that does not fit its field's type.
@@ -220,10 +220,10 @@ def hints_of(cls: type, where: str) -> dict[str, Any]:
 
 
 def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> Any:
-    """A value as its field's type, to which pydantic converts it.
+    """A value that pydantic has converted to its field's type.
 
     Args:
-      candidates: what the value may stand for; the first one that fits counts.
+      candidates: possible readings of the value; the first one that fits counts.
       hint: the type.
       name: of the field, for messages.
       default: of the field; None fits where the default is None.
@@ -273,9 +273,9 @@ def traced_options(config: Options) -> dict[str, Any]:
 
 
 def marks(cls: type, name: str) -> dict[str, Any]:
-    """The metadata of a field: its own, else that of the class which a subclass overrides.
+    """The metadata of a field; a subclass inherits the marks that it does not set.
 
-    So that `warmup_episodes: int = 5` in a subclass changes the default alone.
+    So `warmup_episodes: int = 5` in a subclass changes only the default.
     """
     fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
@@ -289,7 +289,7 @@ def field_lines(
     Args:
       values: plain values by the fields' names.
       classes: groups of fields, each with a class whose docstring has their texts.
-      sources: what stands behind a field's text, such as the layer that its value is from.
+      sources: texts for the ends of the lines, such as the layer that sets a value.
     """
     of_groups = ((group, help_texts(cls).items()) for group, cls in classes)
     texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
@@ -302,7 +302,7 @@ def field_lines(
 
 
 def help_texts(cls: type) -> dict[str, str]:
-    """What the docstrings of a class and its bases say of its attributes, by their names."""
+    """The texts of attributes by name, from the docstrings of a class and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
@@ -313,17 +313,17 @@ def help_texts(cls: type) -> dict[str, str]:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether it is an int or a float, which a bool is not here; see `as_python`."""
+    """Whether a value is an int or a float; a bool does not count. See `as_python`."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def as_python(value: Any) -> Any:
-    """A number or bool of NumPy or jax as Python's; all else, traced ones too, as it is."""
+    """A number or bool of NumPy or jax as Python's; others, traced ones too, stay as they are."""
     if getattr(value, "shape", None) != () or not hasattr(value, "item"):
         return value
     try:
         return value.item()
-    except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
+    except (TypeError, NotImplementedError):  # a traced array has no value yet, a key none at all
         return value
 
 

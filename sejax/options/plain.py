@@ -1,8 +1,8 @@
-"""Plain values and dataclasses: what files and overrides hold, read by the types of the fields.
+"""Dataclasses to plain values, as files and overrides hold them, and back.
 
-A configuration is written as plain values (`to_plain`): numbers, texts, None, lists, dictionaries.
-It is read back (`from_plain`) by the types of its fields, which pydantic converts to: `1` for a
-float, a list for a tuple, the text of an override for a number. Nothing is imported or executed.
+`to_plain` writes a configuration as plain values: numbers, texts, None, lists, dictionaries.
+`from_plain` reads it back. Pydantic converts each value to its field's type: `1` to a float, a list
+to a tuple, the text of an override to a number. Nothing is imported or executed.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ from sejax.options import (
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
-# Fields of earlier versions. A file may still give them this value, with which nothing changes.
+# Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
 GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
 GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
 GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
-# Fields by the names that others give them.
+# Our names of fields, by the names that others use.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
@@ -62,11 +62,11 @@ def from_plain(
     Args:
       cls: a dataclass.
       values: by the names of its fields; those left out have their defaults.
-      where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
+      where: its name in messages, as `agent` in `agent.batch_size`; may be empty.
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
-      ConfigError: for a field that is not there, is missing, or has a value of another type.
+      ConfigError: for an unknown field, a missing one, or a value of another type.
     """
     hints, defaults, fields = hints_of(cls, where), fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
@@ -92,7 +92,7 @@ def require_typed(field: str, path: str, imports: Collection[str] | None) -> Non
       ConfigError: if it is not one of `imports`.
     """
     got = shortened(path, 60)
-    message = f"must be typed, as what a file names is never imported; got {got}. Set {field}={got}"
+    message = f"must be typed, as names in files are never imported; got {got}. Set {field}={got}"
     require(imports is None or path in imports, field, f"{message}, if you trust it.")
 
 
@@ -106,7 +106,7 @@ def fields_of(cls: type) -> dict[str, Any]:
 
 
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
-    """Error for a field that is not there, with the nearest of those that are."""
+    """The error for an unknown field, with the nearest known fields."""
     field, last = shortened(field, 40), field.rpartition(".")[2]
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
@@ -127,7 +127,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[st
     candidates = [value]
     if isinstance(value, str):
         candidates = [parsed(expanded(value)), expanded(value)]
-    elif type(value) in (int, float):  # or a name of digits, as of a folder
+    elif type(value) in (int, float):  # it may be a name of digits, such as a folder's
         candidates = [value, str(value)]
     return checked(candidates, hint, name, default)
 
@@ -157,13 +157,13 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
 def differences(
     there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 10
 ) -> str:
-    """The fields in which two nested settings differ, for a message; empty if in none.
+    """The fields in which two nested settings differ, for a message; empty if they are equal.
 
     Args:
       there: settings that were stored.
-      here: those that are asked for.
+      here: settings that the user asks for.
       free: groups and fields of the first level that may differ.
-      most: fields that are named.
+      most: how many fields are named at most.
 
     Example:
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
@@ -185,7 +185,7 @@ def differences(
 
 
 def split(text: str) -> list[str]:
-    """The parts of a text between commas that are outside of brackets and quotes.
+    """Splits a text at its commas outside of brackets and quotes.
 
     Example:
       >>> split("0.1,[1,2],'a,b'")
@@ -206,7 +206,7 @@ def split(text: str) -> list[str]:
 
 
 def expanded(text: str) -> str:
-    """A text with the user's home folder in the place of a path's `~`.
+    """A text in which the user's home folder replaces a path's `~`.
 
     Example:
       >>> expanded("ppo:~/model.zip") == "ppo:" + os.path.expanduser("~/model.zip")
@@ -222,7 +222,7 @@ def unquoted(text: str) -> str:
 
 
 def parsed(text: str) -> Any:
-    """What the text of an override says by itself: null, true, a number, a list, or the text.
+    """An override's text, read without a type: null, true, a number, a list, or the text itself.
 
     Example:
       >>> parsed("[1e-3,2,true,ddqn]")

@@ -1,8 +1,8 @@
-"""Names to objects: where the name of a plugin becomes code.
+"""From names to objects: where the name of a plugin becomes code.
 
-Everything that a configuration chooses by name is a *plugin* of a group: a dataclass whose fields
-are its options and whose `make` builds the object, or a function that builds it, whose keyword
-parameters are then its options.
+Everything that a configuration chooses by name is a *plugin* of a group. A plugin is a dataclass,
+whose fields are its options and whose `make` builds the object. Or it is a function that builds the
+object; its keyword parameters are its options.
 
 ============= ======================= ==============================================
 group         entry points            `make(...)` gives
@@ -17,12 +17,12 @@ group         entry points            `make(...)` gives
 `machines`    `sejax.machines`        `(config)`: see `sejax.runs.workers`
 ============= ======================= ==============================================
 
-A name is one that comes with sejax, one that an installed package offers as an entry point, or
-`module:attribute`, which imports the module. What reads a file says which of these may be imported
+A name comes with sejax, is an entry point of an installed package, or is `module:attribute`, which
+imports the module. Code that reads a file says which `module:attribute` may be imported
 (`imports`): those that the user has typed, or none.
 
-A configuration is written as plain values (`describe`) and read back (`configure`); what a value
-may be is in `sejax.options.plain`.
+`describe` writes a configuration as plain values, and `configure` reads it back;
+`sejax.options.plain` says what a value may be.
 """
 
 import copy
@@ -65,10 +65,10 @@ class Group(NamedTuple):
     """A kind of plugin.
 
     Attributes:
-      entry_points: group of entry points where packages offer more of it.
-      makes: `module:attribute` of the class of what `make` returns.
-      arguments: what `make` is given, for messages and for functions in a dataclass's place.
-      base: `module:attribute` of the class that each plugin's dataclass is a subclass of.
+      entry_points: group of entry points where packages offer more plugins.
+      makes: `module:attribute` of the class of the objects that `make` returns.
+      arguments: names of `make`'s arguments, for messages and for plugins that are functions.
+      base: `module:attribute` of the class that each plugin's dataclass derives from.
     """
 
     entry_points: str
@@ -95,7 +95,7 @@ GROUPS = {
     "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config",)),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
-# Names that come with sejax; the first of a group is the choice where nothing else makes one.
+# Names that come with sejax. A group's first name is chosen if nothing else makes a choice.
 BUILT_IN = {
     "env": {
         "cartpole": "sejax.envs.classic:CartPole",
@@ -150,7 +150,7 @@ BUILT_IN = {
     },
     "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
 }
-# Beginnings of a task's name: a dataclass with a field `name`.
+# Beginnings of names of tasks: a dataclass with a field `name` serves all names that begin so.
 PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"}
 
 
@@ -163,7 +163,7 @@ def names(group: str) -> list[str]:
 
 
 def is_registered(group: str, name: str) -> bool:
-    """Whether a name is known without importing a module that it names."""
+    """Whether a name comes with sejax or an installed package; a `module:attribute` does not."""
     return _path_of(group, name) is not None
 
 
@@ -172,7 +172,7 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
 
     Args:
       group: one of `GROUPS`.
-      name: see the module.
+      name: see the module's docstring.
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
@@ -203,19 +203,19 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
 def name_of(group: str, config: Makes[Any]) -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
-    if "name" in getattr(cls, "__dataclass_fields__", ()):  # the class has a family of names
+    if "name" in getattr(cls, "__dataclass_fields__", ()):  # the class serves several names
         return str(config.name)  # type: ignore[attr-defined]
     path = f"{cls.__module__}:{cls.__qualname__}"
     built_in = {path: name for name, path in BUILT_IN[group].items()}
     return _NAMES.get(cls) or built_in.get(path, path)
 
 
-_NAMES: dict[type, str] = {}  # of classes that were found by another name than their path
+_NAMES: dict[type, str] = {}  # names of classes that were found by a name other than their path
 
 
 @functools.cache
 def _paths(group: str) -> dict[str, str]:
-    """The `module:attribute` of each registered name; sejax's own cannot be taken over."""
+    """The `module:attribute` of each registered name; packages cannot replace sejax's own."""
     points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
     return BUILT_IN[group] | {x.name: x.value for x in points if x.name not in BUILT_IN[group]}
 
@@ -230,7 +230,7 @@ def _path_of(group: str, name: str) -> str | None:
 
 
 def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | None = None) -> Any:
-    """The configuration that plain values describe: the field `name`, and those of the plugin.
+    """The configuration that plain values describe: the field `name`, and the plugin's fields.
 
     Args:
       group: one of `GROUPS`.
@@ -238,7 +238,7 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
-      ConfigError: for an unknown name or field, or a value that cannot be.
+      ConfigError: for an unknown name or field, or a bad value.
 
     Example:
       >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
@@ -267,18 +267,18 @@ def make(group: str, config: Makes[T], *arguments: Any) -> T: ...
 @overload
 def make(group: str, config: T | Makes[T], *arguments: Any) -> T: ...
 def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
-    """What a configuration configures, built once for equal configurations and arguments.
+    """The object that a configuration makes, built once for equal configurations and arguments.
 
-    Compiled programs are cached by the identity of what they were built from, so that a new
-    instance would compile again. A configuration that cannot be hashed is equal to itself alone.
+    Compiled programs are cached by the identity of the objects that they were built from, so a new
+    object would compile again. A configuration that cannot be hashed equals only itself.
 
     Args:
       group: one of `GROUPS`.
-      config: the configuration; or what it configures, which is returned.
+      config: the configuration; or the object itself, which is returned.
       *arguments: of `Makes.make`.
 
     Raises:
-      ConfigError: if it is neither, makes something of another kind, or cannot be made.
+      ConfigError: if `config` is neither, or if it makes an object of another class or none.
     """
     cls = resolve_name(GROUPS[group].makes)
     if isinstance(config, cls) or not isinstance(config, Makes):
@@ -289,7 +289,7 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
         if not isinstance(part, cls):
             got = f"{type(part).__name__} from {shortened(name_of(group, config))}"
             raise ConfigError(f"{group} must make a sejax.{cls.__name__}; got {got}.", group)
-        _PARTS[key] = config, part  # with config, its id stays its own
+        _PARTS[key] = config, part  # while config is kept, no other object gets its id
     return cast(T, _PARTS[key][1])
 
 
@@ -297,7 +297,7 @@ _PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
 
 def is_hashable(config: object) -> bool:
-    """Whether a configuration serves as a key: a frozen dataclass of hashable values does."""
+    """Whether a configuration can be a key, as a frozen dataclass of hashable values can."""
     try:
         hash(config)
     except TypeError:
@@ -333,17 +333,17 @@ def require_path(field: str, path: str) -> None:
 
 
 def _suggestions(text: str) -> list[str]:
-    """The `module:attribute` that a dotted name or the path of a file may stand for."""
+    """The `module:attribute` that the user may mean by a dotted name or the path of a file."""
     match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
     return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []
 
 
 def imported(field: str, path: str) -> Any:
-    """What `module:attribute` names, which is imported.
+    """Imports the module of a `module:attribute`, and returns the attribute.
 
     Raises:
-      ConfigError: if it is not of this form, the module cannot be imported, or has nothing of this
-        name.
+      ConfigError: if the text is not of this form, or the module cannot be imported or lacks the
+        attribute.
     """
     require_path(field, path)
     try:
@@ -357,7 +357,7 @@ def imported(field: str, path: str) -> Any:
 
 @functools.cache
 def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
-    """A dataclass whose fields are a function's parameters beyond those that `make` is given."""
+    """A dataclass for a function: its fields are the parameters after the group's arguments."""
     arguments, signature = GROUPS[group].arguments, inspect.signature(function)
     parameters = list(signature.parameters.values())
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)

@@ -1,4 +1,4 @@
-"""The overrides of a search: its own fields, what it searches, and what stays fixed."""
+"""The overrides of a search: its own fields, the searched ranges, and the fixed settings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from sejax.searching import spaces
 REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.
 TAKEN = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
-# Fields that may differ between the workers of a study and between its sessions, and names.
+# Names, and fields that may differ between the workers of a study and between its sessions.
 FREE = ("trials", "search_dir", "verify", "fresh_seeds", "study", "space", "devices")
 
 
@@ -30,15 +30,15 @@ class StudyConfig(Options):
 
     Attributes:
       trials: trials that end, pruned or complete
-      min_generations: before a trial may be pruned; as many as max_generations: none is
-      max_generations: of a trial that is not pruned
+      min_generations: generations before a trial may be pruned; if max_generations, none is pruned
+      max_generations: generations of a trial that is not pruned
       seeds: runs of a trial, whose mean counts
       space: a preset of ranges, or FILE.yaml
       study: null: <env>-<proxy>-<agent>
       search_dir: null: runs/search-<study>
-      verify: The best trials that are tried again with new seeds, as the best score of many is the
-        luckiest too.
-      fresh_seeds: new seeds of each that is tried again
+      verify: How many of the best trials are tried again with new seeds, as the best score of many
+        is the luckiest too.
+      fresh_seeds: new seeds of each trial that is tried again
     """
 
     group: ClassVar[str] = ""
@@ -68,7 +68,7 @@ class StudyConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyPlan:
-    """What is searched.
+    """A search: its own fields, the fixed overrides, and the searched fields.
 
     Attributes:
       config: the search's own fields.
@@ -84,14 +84,14 @@ class StudyPlan:
         """The configuration of a trial's runs.
 
         Raises:
-          ConfigError: if it is none that can run.
+          ConfigError: if it cannot run.
         """
         length = f"generations={self.config.max_generations}", "checkpoint_every=1"
         return configuration.config([*self.fixed, *overrides, *length])
 
     @cached_property
     def default(self) -> LearnConfig:
-        """The configuration of a trial whose overrides are the fixed ones."""
+        """The configuration of a trial with only the fixed overrides."""
         return self.trial_config()
 
     @property
@@ -104,11 +104,11 @@ class StudyPlan:
         return Path(self.config.search_dir or Path("runs", f"search-{as_file_name(self.study)}"))
 
     def overrides(self, params: Mapping[str, Any]) -> list[str]:
-        """The overrides that set what is searched to stored parameters."""
+        """The overrides that set the searched fields to stored parameters."""
         return [f"{name}={x.value(params)}" for name, x in self.space.items()]
 
     def settings(self) -> dict[str, object]:
-        """What all workers of a study have in common, and `FREE` fields; plain values."""
+        """The settings of a study, plain values; workers may differ in the `FREE` fields."""
         ranges = {name: dimension.text for name, dimension in self.space.items()}
         return {**self.default.plain(), **to_plain(self.config), "ranges": ranges}
 
@@ -116,12 +116,12 @@ class StudyPlan:
 def read(overrides: Sequence[str]) -> StudyPlan:
     """A search from its command's overrides.
 
-    Those that name a field of `StudyConfig` set it, ranges and choices are searched, and all
-    others stay fixed. A field that is fixed, also by a preset file, or has a range of its own is
-    left out of `space=`.
+    Overrides of `StudyConfig`'s fields set these. Ranges and choices are searched. All other
+    overrides stay fixed. `space=` gives no range to a field that is fixed, also by a preset file,
+    or that has its own range.
 
     Raises:
-      ConfigError: for a bad value, for what cannot be searched, and where nothing is.
+      ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
     values, fixed, space = {}, [], {}
     for override in overrides:
@@ -148,6 +148,6 @@ def read(overrides: Sequence[str]) -> StudyPlan:
                 space.setdefault(name, dimension)
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
-    must = "must be given and have ranges for these agents, or ranges of fields; got none"
+    must = "must be given and have ranges for these agents, or fields must have some; got none"
     require(space, "space", f"{must}. Set space=paper_se, or es.noise_std='{spaces.EXAMPLE}'.")
     return search

@@ -1,16 +1,16 @@
-"""What a search draws from: ranges and choices in overrides, and presets of them.
+"""The ranges and choices that a search draws from, in overrides and in presets.
 
 ================================================= =================================================
 `choice(tanh, relu)`, or `tanh,relu`              these values
 `interval(0.1, 1)`                                numbers between the two
 `int(interval(1, 10))`                            whole numbers, both ends included
 `range(16, 65, 16)`                               16, 32, 48, 64
-`tag(log, interval(0.01, 0.3))`                   uniform in the logarithm; also of whole numbers
+`tag(log, interval(0.01, 0.3))`                   uniform in the logarithm; also for whole numbers
 `tag(log, inverse, interval(0.9, 0.999))`         uniform in the logarithm of the distance from 1,
                                                   which the paper's tables call "True (inv.)"
 ================================================= =================================================
 
-A YAML file of a space maps fields to these, and under `with_agent` agents to ranges of their own.
+A YAML file of a space maps fields to these; under `with_agent` it maps agents to their own ranges.
 """
 
 import math
@@ -28,20 +28,20 @@ from sejax.options.plain import split
 from sejax.runs.compose import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
-DIGITS = 6  # of a number: the override says exactly what was tried
+DIGITS = 6  # of a drawn number in its override: exactly this number is tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
 _CALL = re.compile(r"(choice|range|interval|int|tag)\((.*)\)", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dimension:
-    """A field and what it is drawn from.
+    """A field and the distribution that it is drawn from.
 
     Attributes:
       name: of the field, such as `es.noise_std`.
       text: the range or choice, as an override has it.
       distribution: Optuna's.
-      is_inverse: whether 1 - value is drawn in the place of the value.
+      is_inverse: whether 1 - value is drawn instead of the value.
     """
 
     name: str
@@ -55,14 +55,14 @@ class Dimension:
         return f"1 - {self.name}" if self.is_inverse else self.name
 
     def value(self, params: Mapping[str, Any]) -> str:
-        """The field's value of stored parameters, as in an override."""
+        """The field's value in stored parameters, as an override writes it."""
         value = params[self.parameter]
         if isinstance(value, float):
             value = f"{1 - value if self.is_inverse else value:.{DIGITS}g}"
         return str(value)
 
     def parameter_of(self, value: float | str | None) -> float | str | None:
-        """The stored parameter that stands for a field's value; None if it is not drawn from."""
+        """The stored parameter for a field's value; None if the value is outside of the range."""
         try:
             if isinstance(self.distribution, distributions.CategoricalDistribution):
                 value = as_text(value)
@@ -75,7 +75,7 @@ class Dimension:
 
 
 def is_range(text: str) -> bool:
-    """Whether the value of an override is searched; a comma makes a sweep elsewhere."""
+    """Whether an override's value is searched; in other commands a comma makes a sweep."""
     return _CALL.fullmatch(text) is not None or len(split(text)) > 1
 
 
@@ -130,11 +130,11 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
 
     Args:
       name: of the preset, or a path that ends in .yaml.
-      agents: the agents that are trained, by the group of their fields: `agent`, or in a mixture
-        `agents.KEY`, where what agents share has no ranges.
+      agents: the names of the agents by the group of their fields: `agent`, or `agents.KEY` in a
+        mixture. In a mixture, `with_agent` gives ranges only to the agents' own fields.
 
     Raises:
-      ConfigError: if it is not there, or is no such file, or names a `module:attribute`.
+      ConfigError: if it is missing, is no such file, or names a `module:attribute`.
     """
     path = Path(name) if name.endswith(".yaml") else FOLDER / f"{name}.yaml"
     try:

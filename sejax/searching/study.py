@@ -1,7 +1,7 @@
 """The study of a search: its database, the loop in which a worker takes trials, and the results.
 
-Workers of a study share its folder. A worker holds a lock on its trial, which ends with its
-process, however that ends; the next one that looks goes on with a trial whose lock is free.
+Workers of a study share its folder. A worker locks its trial; the lock ends with the worker's
+process, even if that is killed. The next worker goes on with a running trial whose lock is free.
 """
 
 import contextlib
@@ -36,11 +36,11 @@ SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # of a tr
 
 
 def open_study(search: StudyPlan) -> optuna.Study:
-    """Makes the study, whose first trial has the current settings, or opens it if it is there.
+    """Opens the study, or makes it; a new one first tries the current settings, if in range.
 
     Raises:
-      ConfigError: if the folder cannot be used, or the study is one of another search.
-      OptunaError, SQLAlchemyError: if there is no database that can be used.
+      ConfigError: if the folder cannot be used, or holds the study of another search.
+      OptunaError, SQLAlchemyError: if the database cannot be used.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     folder = search.folder
@@ -59,7 +59,7 @@ def open_study(search: StudyPlan) -> optuna.Study:
         )
         try:
             study.get_trials(deepcopy=False)  # reads all of it
-        except (KeyError, TypeError, ValueError) as error:  # of what somebody wrote there
+        except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
             fields = configuration.words_of(search.default)
@@ -77,11 +77,11 @@ class Progress(NamedTuple):
     """How a trial has gone so far.
 
     Attributes:
-      scores: `[generation]`, what a trial is worth after each; nan where nothing finite came of it.
+      scores: `[generation]`, the trial's score after each generation; nan if it is not finite.
       train_steps: of all agents.
-      generations: that were computed, the mean over seeds: fewer than there are scores where runs
-        have solved their task.
-      is_over: whether all runs have solved it.
+      generations: computed generations, the mean over seeds; fewer than scores if runs have solved
+        their task.
+      is_over: whether all runs have solved their task.
     """
 
     scores: np.ndarray
@@ -93,15 +93,16 @@ class Progress(NamedTuple):
 def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callable[[int], Progress]:
     """Runs that learn proxies, a run directory each, by one executable.
 
-    A score is the mean of incumbents over seeds. A run that has solved its task keeps its last one.
+    A score is the search mean's score, averaged over seeds. A run that has solved its task keeps
+    its last score.
 
     Args:
       config: of the runs.
-      folder: the run directory; of several, `seed0` and so on in it.
+      folder: the run directory; for several runs, `seed0` and so on in it.
       seeds: counted from the configuration's own.
 
     Returns:
-      A function that goes on up to a generation.
+      A function that continues the runs up to a number of generations.
     """
     chunks = workers.make_chunks(config)
 
@@ -125,12 +126,12 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
 
 
 def work(study: optuna.Study, search: StudyPlan) -> None:
-    """Takes trials until as many as asked for have ended.
+    """Takes trials until as many have ended as the user asks for.
 
-    With several workers a few more may end, as each looks before it takes one.
+    With several workers a few more may end, as a worker counts before it takes a trial.
 
     Raises:
-      ConfigError, OSError: of a trial that cannot be written.
+      ConfigError, OSError: if a trial cannot be written.
     """
     while True:
         with contextlib.ExitStack() as held:
@@ -150,16 +151,16 @@ def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack)
             continue
         try:
             held.enter_context(_lock(search, _name(frozen.number), timeout=0))
-        except filelock.Timeout:  # its worker is there
+        except filelock.Timeout:  # its worker is alive
             continue
         trial = Trial(study, frozen._trial_id)
-        for name, distribution in space.items():  # of which it may lack some
+        for name, distribution in space.items():  # the trial may lack some parameters
             trial._suggest(name, distribution)
         return trial
     if sum(trial.state.is_finished() for trial in known) >= search.config.trials:
         return None
     if not any(trial.state == TrialState.WAITING for trial in known):
-        # Drawn at once: whoever is killed meanwhile leaves no half of it, and draws the same again.
+        # Drawn at once: a worker killed meanwhile leaves no half trial; the next draws the same.
         seed = np.random.SeedSequence([search.default.seed, len(known)]).generate_state(1)[0]
         draft = _copy(study)
         draft.sampler = optuna.samplers.TPESampler(seed=int(seed))
@@ -170,7 +171,7 @@ def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack)
 
 
 def _copy(study: optuna.Study) -> optuna.Study:
-    """A copy in memory, where trying leaves nothing."""
+    """A copy in memory; changes to it do not change the study."""
     name, pruner = study.study_name, study.pruner
     copy = optuna.create_study(study_name=name, pruner=pruner, direction="maximize")
     copy.add_trials(study.get_trials(deepcopy=False))
@@ -180,7 +181,7 @@ def _copy(study: optuna.Study) -> optuna.Study:
 def _is_behind(trial: Trial, rung: int) -> bool:
     """Whether a trial is pruned at a rung.
 
-    The answer is kept before Optuna hears that the trial has come so far: it answers once.
+    The answer is kept before Optuna hears that the trial has reached the rung: it answers once.
     """
     study, name = trial.study, f"pruned_at_{rung}"
     if name not in trial.user_attrs:
@@ -191,7 +192,7 @@ def _is_behind(trial: Trial, rung: int) -> bool:
 
 
 def _computed(trial: Trial, search: StudyPlan) -> str:
-    """Computes a trial rung by rung, until it is pruned or complete; what is said of it."""
+    """Computes a trial rung by rung, until it is pruned or complete; returns a line about it."""
     study, overrides = trial.study, search.overrides(trial.params)
     folder, seeds = search.folder / _name(trial.number), range(search.config.seeds)
     trial.set_user_attr("settings", shlex.join(overrides))
@@ -249,7 +250,7 @@ def report(study: optuna.Study, search: StudyPlan) -> None:
     print(f"\nThe best of {len(rows)} trials, of which {len(best)} are complete:\n{table}")
     if search.config.verify:
         best = best.head(search.config.verify)[["number", "value", "settings"]]
-        with _lock(search, "verification"):  # another worker may be at it
+        with _lock(search, "verification"):  # another worker may be verifying
             again = [_tried_again(study, search, number) for number in best["number"]]
         best = best.join(pd.DataFrame(again, index=best.index))
         order = ["verified", "verified_cost"]
@@ -261,7 +262,7 @@ def report(study: optuna.Study, search: StudyPlan) -> None:
 
 
 def _tried_again(study: optuna.Study, search: StudyPlan, number: int) -> dict[str, float]:
-    """What the settings of a trial are worth with seeds that no trial has had, and what it costs.
+    """The score of a trial's settings with seeds that no trial has had, and its generations.
 
     The best score of many is the luckiest too.
     """
@@ -273,7 +274,7 @@ def _tried_again(study: optuna.Study, search: StudyPlan, number: int) -> dict[st
 
 
 def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
-    """Writes settings as a command, which is returned, and as a preset."""
+    """Writes settings as a command and as a preset; returns the command."""
     words = [*search.fixed, *overrides]
     line = shlex.join(["python", "-m", "sejax.run", *words])
     settings = {k: parsed(x) if isinstance(x, str) else x for k, x in compose.read(words).items()}
