@@ -1,1 +1,1 @@
-"""SEs from policies: search or copy one, write it down as an SE, and see what the SE teaches."""
+"""SEs from policies: search or copy a policy, write it as an SE, and see what the SE teaches."""

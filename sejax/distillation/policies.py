@@ -1,10 +1,10 @@
 """Policies that `python -m sejax.distill` is given, and their copies in the form of an exact SE.
 
 A policy is a model of Stable-Baselines3, a function, or an agent of sejax. Its copy, affine maps
-with ReLUs between, is fitted to what the policy does in states that both visit. In each round the
-copy plays, with an emulated error of its own in each episode, the policy says what it would have
-done, and the copy is fitted to all that was seen: states that a rough student gets into are among
-them.
+with ReLUs between, is fitted to the policy's actions in states that both visit. In each round the
+copy plays episodes, each with another emulated error. The policy says what it would have done
+there, and the copy is fitted to all states so far. So they include states that a rough student
+gets into.
 
 Source: Ross et al., "A reduction of imitation learning and structured prediction to no-regret
 online learning" (DAgger, 2011). The emulated error is ours.
@@ -37,7 +37,7 @@ Actor = Callable[[np.ndarray], np.ndarray]
 FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), module:function, or an agent such as ppo."
 _POLICY_ERROR = 0.1  # of a copy in an episode, root mean square in units of the action's bound
 _BATCH_SIZE, _LEARNING_RATE = 256, 3e-3  # of the fit, by Adam
-_OVERSHOOT = 0.05  # weight of what lies beyond the bounds, where clipping has no slope
+_OVERSHOOT = 0.05  # weight of outputs beyond the bounds, where clipping has no slope
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +46,9 @@ class CopyConfig(Options):
 
     Attributes:
       hidden_size: ReLUs; 0: a linear copy
-      episodes: of a round
-      steps: of Adam in each round
-      agent_steps: On the real task, of an agent that `policy` names.
+      episodes: episodes of a round
+      steps: steps of Adam in each round
+      agent_steps: training steps on the real task, if `policy` names an agent
     """
 
     group: ClassVar[str] = "copy"
@@ -74,8 +74,8 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
       key: of that training.
 
     Raises:
-      ConfigError: for anything else; where the policy is called, if it fails, or its actions are
-        none of the task.
+      ConfigError: for anything else. When the policy is called: if it fails, or if the task does
+        not have its actions.
     """
     if registry.is_registered("agent", text):
         return _of_agent(text, task, agent_steps, key)
@@ -86,7 +86,7 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
 
 
 def _checked(act: Actor, task: Task) -> Actor:
-    """The policy, whose actions are looked at."""
+    """The policy, with checks of its actions."""
     count = task.num_actions
     must = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
 
@@ -116,7 +116,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
         got = f"got {shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
         message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
         raise ConfigError(message, "policy") from error
-    # A task whose bounds are not alike everywhere is scaled to [-1, 1].
+    # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     is_discrete = task.num_actions is not None
     factor = 1 if is_discrete else task.max_action / np.asarray(model.action_space.high, float)
     return lambda obs: model.predict(obs, deterministic=True)[0] * factor
@@ -141,7 +141,7 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
 def copied(
     config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]
 ) -> tuple[list[Lesson], pd.DataFrame]:
-    """The copy of a policy as the only lesson, and a row of what it cost: `real_steps` and `cpu_s`.
+    """The copy of a policy as the only lesson, and a row of its costs: `real_steps` and `cpu_s`.
 
     Args:
       config: form and effort.
@@ -152,7 +152,7 @@ def copied(
     require_vectors(task)
     started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
-    # The unused key keeps the numbers of stored proxies.
+    # One key is unused: without it the numbers of stored proxies would change.
     key, key_visit, _, key_fit = jax.random.split(key, 4)
     policy_states, policy_return = visit(task, act, key_visit, config.episodes)
     scale = policy_states.mean(0), np.maximum(policy_states.std(0), 1e-2)
@@ -174,9 +174,9 @@ def copied(
 
 
 def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:
-    """What a policy of affine maps and ReLUs does: the best action, or its outputs clipped.
+    """The actor of a policy of affine maps and ReLUs: the best action, or the outputs clipped.
 
-    The `error` is added to its outputs `[state, action_dim]`.
+    The `error` is added to the outputs, `[state, action_dim]`.
     """
 
     def act(obs: np.ndarray) -> np.ndarray:
@@ -191,16 +191,16 @@ def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.ze
 def erring(
     task: Task, layers: Sequence[Layer], states: np.ndarray, key: Array, episodes: int
 ) -> Actor:
-    """A policy with a random linear error of the observation, another one in each episode.
+    """A policy with an error that is linear in the observation, another error in each episode.
 
     Args:
       task: the real task.
       layers: the policy.
-      states: that it visits; an error is linear in observations of their mean 0 and variance 1. Its
-        unit is the action's bound; of discrete actions the deviation of the policy's outputs in
-        these states.
+      states: states that the policy visits. Their mean and deviation whiten the observations that
+        an error is linear in. Its unit is the action's bound; for discrete actions, the deviation
+        of the policy's outputs in these states.
       key: of the errors.
-      episodes: that are played side by side.
+      episodes: number of episodes, which are played side by side.
     """
     mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
     unit = task.max_action
@@ -239,7 +239,7 @@ def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray
 
 @functools.cache
 def _stepper(task: Task) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Compiled: resets of many episodes, and a step of each."""
+    """Two compiled functions: the resets of many episodes, and a step of each."""
     env, params = task.env, task.params
     reset = jax.jit(jax.vmap(lambda key: env.reset_env(key, params)))
     return reset, jax.jit(jax.vmap(lambda key, state, x: env.step_env(key, state, x, params)[:4]))
@@ -253,9 +253,10 @@ def fit(
     scale: tuple[np.ndarray, np.ndarray],
     key: Array,
 ) -> list[Layer]:
-    """A copy of what a policy does in some states, whose mean and deviation are the `scale`.
+    """A copy that is fitted to a policy's actions in some states.
 
-    Continuous actions by squared error after clipping, discrete ones by cross-entropy.
+    The loss of continuous actions is the squared error after clipping, of discrete ones the
+    cross-entropy. The `scale` is the mean and the deviation that whiten states.
     """
     is_discrete = task.num_actions is not None
     mean, std = scale
@@ -275,7 +276,7 @@ def fit(
         if is_discrete:
             return optax.softmax_cross_entropy_with_integer_labels(outputs, wanted).mean()
         clipped = jnp.clip(outputs, -1.0, 1.0)
-        # Beyond a bound that is wrong, clipping has no slope: tanh pulls back.
+        # An output beyond the wrong bound gets no slope through clipping: tanh pulls it back.
         pull = 0.1 * (jnp.tanh(outputs) - wanted) ** 2
         return jnp.mean((clipped - wanted) ** 2 + _OVERSHOOT * (outputs - clipped) ** 2 + pull)
 

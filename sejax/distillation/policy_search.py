@@ -1,13 +1,13 @@
 """Augmented random search: a linear policy of a task, found by rollouts alone.
 
-A generation tries a few random directions of the policy's weights, both ways, an episode each, and
-moves along those that made the largest difference. It is one compiled program.
+A generation tries random directions of the policy's weights, both ways, an episode each. It moves
+along the directions with the best returns. It is one compiled program.
 
-A policy that is to be taught to agents must bear that they learn it roughly. So each episode may be
-played with an error of its own, a random linear map of the observation that is added to the policy.
+Agents learn a policy only roughly, and a policy that teaches must bear that. So each episode may
+have its own error: a random linear map of the observation that is added to the policy.
 
-A whole search starts several times; the start whose policy was tested best goes on. What was done
-up to each test is kept, so that a search which was stopped goes on.
+A whole search starts several times. The start with the best tested policy goes on. The work up to
+each test is kept, so that a stopped search goes on.
 
 Source: Mania et al., "Simple random search of static linear policies is competitive for
 reinforcement learning" (2018), Algorithm 2 (V2-t). The emulated error is ours.
@@ -42,21 +42,21 @@ COLUMNS = ("start", "generation", "test_mean", "test_std", "real_steps", "cpu_s"
 
 @dataclass(frozen=True, kw_only=True)
 class SearchConfig(Options):
-    """How a linear policy is searched. Weights are those of observations with mean 0, variance 1,
-    and of actions in units of the task's bound.
+    """How a linear policy is searched. Its weights map observations with mean 0, variance 1 to
+    actions in units of the task's bound.
 
     Attributes:
-      num_starts: Searches that begin, each for so many generations (up to a test); the one whose
-        policy was tested best goes on. A search may stop at a poor gait, which shows early.
+      num_starts: Searches that begin. Each runs start_generations (up to a test); the one with the
+        best tested policy goes on, as a search may get stuck at a poor gait, which shows early.
       num_directions: N, two episodes each
       num_top: b: directions that count
       noise_std: nu
       step_size: alpha
       constant: Share of the generations after which the step size declines, to a tenth at the end.
-      policy_error: Root mean square of the error of an episode's policy, in units of the action's
-        bound; of discrete actions in units of the policy's own outputs.
-      alive_bonus: Subtracted from each step's reward while searching; unless given, the task's
-        reward for being healthy.
+      policy_error: Root mean square of an episode's error, in units of the action's bound; for
+        discrete actions, in units of the policy's own outputs.
+      alive_bonus: Subtracted from each step's reward in the search; if not given, the task's reward
+        for being healthy.
       num_tests: episodes without the error
       until_solved: Whether the search ends as soon as a tested policy solves the task.
     """
@@ -85,12 +85,12 @@ class SearchConfig(Options):
 
 
 class Policy(NamedTuple):
-    """A linear policy, and the moments of observations that it is a map of.
+    """A linear policy, and the moments of its observations.
 
     Attributes:
-      weights: `[action_dim, obs_dim + 1]`, the last column a bias; of observations less the mean
-        over the deviation, to actions in units of the bound.
-      num_seen: observations that the moments are of.
+      weights: `[action_dim, obs_dim + 1]`, the last column a bias. They map observations, less the
+        mean and over the deviation, to actions in units of the bound.
+      num_seen: number of observations in the moments.
       mean: `[obs_dim]`.
       square: `[obs_dim]`, sum of squared differences from the mean.
     """
@@ -132,7 +132,7 @@ class Search(NamedTuple):
 
 
 def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
-    """What a linear policy does."""
+    """The action of a linear policy."""
     outputs = policy.weights @ jnp.append((obs - policy.mean) / policy.std, 1.0)
     if task.num_actions is not None:
         return jnp.argmax(outputs).astype(jnp.int32)
@@ -145,7 +145,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     Args:
       config: of the search.
       task: the real task.
-      devices: that episodes are spread over; None for all.
+      devices: number of devices that episodes are spread over; None for all.
 
     Raises:
       ConfigError: for a task whose observations are no vectors.
@@ -207,15 +207,15 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
 def random_map(key: Array, shape: tuple[int, ...]) -> Float[Array, "... inputs"]:
     """A random linear map of whitened observations, the last column a bias.
 
-    Its outputs have a root mean square of 1 over maps and observations, a fifth of their variance
-    by the bias.
+    Its outputs have a root mean square of 1 over maps and observations; the bias makes a fifth of
+    their variance.
     """
     scale = jnp.full(shape[-1], (0.8 / (shape[-1] - 1)) ** 0.5).at[-1].set(0.2**0.5)
     return scale * jax.random.normal(key, shape)
 
 
 def step_size(config: SearchConfig, number: Array | int) -> Array:
-    """That of a generation: constant at first, then a straight line to a tenth."""
+    """The step size of a generation: constant at first, then a straight line to a tenth."""
     first = config.constant * config.generations
     left = (config.generations - number) / max(config.generations - first, 1.0)
     return config.step_size * jnp.clip(left, 0.1, 1.0)
@@ -244,10 +244,10 @@ def with_moments(policy: Policy, obs: Float[Array, "step obs_dim"], valid: Array
 
 
 class Lesson(NamedTuple):
-    """A policy that is to be taught.
+    """A policy that an SE is to teach.
 
     Attributes:
-      generation: of the search that it is of; 0 for a copy.
+      generation: the policy's generation in its search; 0 for a copy.
       layers: as of `sejax.proxies.exact`.
       states: observations that it visited, `[state, obs_dim]`.
       policy_return: its mean return on the real task.
@@ -267,12 +267,12 @@ def searched(
     store: Store,
     devices: int | None = None,
 ) -> tuple[list[Lesson], pd.DataFrame]:
-    """The best tested policy of each of so many equal parts of a search.
+    """The best tested policy of each of `num_lessons` equal parts of a search.
 
     Args:
       options: of the search.
       task: the real task.
-      num_lessons: parts of the search; at most as many as policies are tested.
+      num_lessons: number of parts; fewer if fewer policies are tested.
       keys: `search`, `test` and `record`.
       store: where each step of the search is kept.
       devices: number of devices that episodes are spread over; None for all.
@@ -300,7 +300,7 @@ def searched(
         return {name: np.asarray(value) for name, value in (policy._asdict() | row).items()}
 
     def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
-        """The policy of a start after the blocks of generations that begin with these."""
+        """A start's policy after the blocks of generations that begin at `firsts`."""
         for first in firsts:
             if options.until_solved and rows and _test_mean(rows[-1]) >= task.solved_reward:
                 break
@@ -322,9 +322,9 @@ def searched(
 
 
 def _lesson(options: SearchConfig, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:
-    """A tested policy, with what it visits in other episodes: tests had a part in choosing.
+    """A tested policy, with the states that it visits in new episodes: the tests chose it.
 
-    Their cost is added to the row.
+    The cost of the new episodes is added to the row.
     """
     started, generation = time.process_time(), int(row["generation"])
     policy = _policy_of(row)
@@ -340,5 +340,5 @@ def _policy_of(tested: Arrays) -> Policy:
 
 
 def _test_mean(tested: Arrays) -> float:
-    """The mean return of its tests; the lowest number if it is none."""
+    """The mean return of a policy's tests; the lowest number if it is nan."""
     return float(np.nan_to_num(tested["test_mean"], nan=-np.inf))

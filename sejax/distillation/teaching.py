@@ -1,8 +1,8 @@
-"""What SEs of policies teach: students on each, and which of the SEs teaches best.
+"""What SEs of policies teach: students train on each SE, and their returns grade the SEs.
 
-A policy that earns much may be a poor teacher: agents learn it roughly, and a fragile gait then
-falls. So an SE is chosen by agents that train on it and are tested on the real task, and others
-say what it teaches.
+A policy with a high return may be a poor teacher: agents learn it roughly, and a fragile gait then
+falls. So agents that train on an SE and are tested on the real task choose the SE. Other agents
+measure what it teaches.
 """
 
 import functools
@@ -34,16 +34,16 @@ def students(
 ) -> pd.DataFrame:
     """A row for each student on each SE.
 
-    The students of an agent are kept in the store before those of the next one train.
+    The students of an agent are kept in the store before the next agent's students train.
 
     Args:
       ses: environment and weights of each SE; all have one configuration.
-      lessons: that the SEs were made of.
+      lessons: the lessons that the SEs were made of.
       config: agents and their trainings.
       keys: of the students, `[student]`, the same on all SEs.
       store: where students are kept.
     """
-    # By the weights, as what `policy` names may have changed.
+    # The weights name the entry: the policy behind the name in `policy` may have changed.
     taught_by = fingerprint({str(i): weights for i, (_, weights) in enumerate(ses)})
     names = ("generation", "policy_return", "agent", "student")
     lines = [(x.generation, x.policy_return, "", i) for x in lessons for i in range(len(keys))]
@@ -69,7 +69,7 @@ def teach(
     Args:
       ses: environment and weights of each SE; all have one configuration.
       agent: of the students.
-      config: its `training` is that of a student, its `devices` are those that students use.
+      config: its `training` is a student's training; students use its `devices`.
       keys: of the students, `[student]`, the same on all SEs.
 
     Returns:
@@ -90,7 +90,7 @@ def teach(
 
 
 def counted(returns: pd.Series) -> pd.Series:
-    """Returns in which a student that diverged is as bad as the worst of all.
+    """Returns in which a student that diverged counts as the worst student.
 
     Raises:
       FailedError: if all diverged.
@@ -103,7 +103,7 @@ def counted(returns: pd.Series) -> pd.Series:
 def grades(rows: pd.DataFrame) -> pd.Series:
     """How well each SE teaches, by generation: the mean over agents of (mean + worst student) / 2.
 
-    A student that diverged is as bad as the worst of all.
+    A student that diverged counts as the worst student.
     """
     returns = counted(rows["test_return"])
     by_agent = returns.groupby([rows["generation"], rows["agent"]]).agg(["mean", "min"])
