@@ -27,15 +27,15 @@ def names() -> list[str]:
 
 
 def make(name: str, **options: object) -> Task:
-    """Builds a task once and returns the same object ever after.
+    """Builds a task once; later calls return the same object.
 
     Args:
       name: one of `names()`, `gymnax/` and an id that gymnax knows, or `module:attribute`.
       **options: fields of its configuration, as `backend="spring"` for halfcheetah.
 
     Raises:
-      ConfigError: for an unknown name or option, the known ones nearest first; or if it needs a
-        package that is not installed.
+      ConfigError: for an unknown name or option, with the known ones, nearest first; or if the task
+        needs a package that is not installed.
 
     Example:
       >>> make("cartpole").solved_reward
@@ -45,7 +45,7 @@ def make(name: str, **options: object) -> Task:
 
 
 def make_from(config: TaskConfig) -> Task:
-    """The task that a configuration describes, built once; it knows where it came from."""
+    """The task that a configuration describes, built once; its `origin` is the configuration."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
         vars(task)["origin"] = registry.describe("env", config)

@@ -18,7 +18,7 @@ from sejax.envs.wrappers import as_vectors
 
 
 class TaskConfig(Protocol):
-    """A dataclass whose fields are a task's options; its `spec`, if it has one, is the task's."""
+    """A dataclass whose fields are a task's options; it may have the task's `spec`."""
 
     def make(self) -> "Task": ...
 
@@ -27,23 +27,23 @@ class TaskConfig(Protocol):
 class Task(TaskSpec):
     """A real task: its spec, and the environment that agents are tested on.
 
-    Agents and networks see vectors: an observation that is no `[obs_dim]` float32 vector is
-    flattened, and continuous actions that do not lie in [-x, x] in each dimension are scaled to
-    [-1, 1] (`sejax.envs.wrappers.AsVectors`). Build a task once: what is compiled for it is kept by
-    identity.
+    Agents and networks see vectors. If observations are no `[obs_dim]` float32 vectors, or
+    continuous actions do not lie in the same [-x, x] in each dimension, then
+    `sejax.envs.wrappers.AsVectors` flattens observations and scales actions to [-1, 1]. Build a
+    task once: programs that are compiled for it are cached by its identity.
 
     Args:
-      name: what it is called, in files too.
-      env: gymnax 1.x `Environment`, of which `reset_env`, `step_env`, `is_truncated`,
-        `action_space`, `observation_space` and `default_params` are used; its params have
-        `max_steps_in_episode`, its state has `time` for RNs with `zero_at_terminal`. `step_env`
-        returns observation, state, reward, terminated and info. A step's `info` may say under
-        "discount" what a target bootstraps with; 1 minus terminated if not.
+      name: the task's name, in files too.
+      env: gymnax 1.x `Environment`. sejax uses `reset_env`, `step_env`, `is_truncated`,
+        `action_space`, `observation_space` and `default_params`. Its params have
+        `max_steps_in_episode`; its state has `time` for RNs with `zero_at_terminal`. `step_env`
+        returns observation, state, reward, terminated and info. `info["discount"]` may give the
+        factor of a target's bootstrap value; without it the factor is 1 minus terminated.
       params: its `EnvParams`; the environment's `default_params` if not given.
       solved_reward, info_keys, augmented_keys: as of `TaskSpec`.
       max_steps: step limit of an episode; put into `params`, or taken from there if not given.
-      origin: plain values that `sejax.envs.make` makes it from again; None for one made by hand,
-        which must be given to load a proxy of it.
+      origin: plain values from which `sejax.envs.make` makes the task again. None for a task made
+        by hand: whoever loads a proxy of it must pass the task.
 
     Raises:
       ConfigError: for an observation or action space that is neither discrete nor a bounded box, or
@@ -83,7 +83,7 @@ class Task(TaskSpec):
             vectors = as_vectors(env, params)
             observation, action = spaces_of(vectors, params)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
-                _check_step(vectors, params, name)  # seconds for some, which have their own tests
+                _check_step(vectors, params, name)  # takes seconds; the others have tests
         except options.ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
@@ -106,8 +106,8 @@ class Task(TaskSpec):
 def require_own_steps(env: Environment) -> None:
     """Checks that an environment is no wrapper of gymnax's kind.
 
-    Such a one changes `step`, and its `step_env` is that of the environment in it: what it does
-    would silently be left out.
+    Such a wrapper changes `step`, but its `step_env` is that of the environment in it. sejax calls
+    `step_env`, so it would silently leave the wrapper out.
 
     Raises:
       ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`.
@@ -120,7 +120,7 @@ def require_own_steps(env: Environment) -> None:
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:
-    """Traces a step, so that faults of an environment are met before an agent trains there.
+    """Traces a step, so that an environment's faults show before an agent trains on it.
 
     Raises:
       ConfigError: if it returns other shapes or dtypes than the spaces and `reset_env` have.

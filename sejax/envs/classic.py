@@ -1,8 +1,8 @@
-"""The classic control tasks: gymnax's dynamics, and our own of the continuous mountain car.
+"""The classic control tasks: gymnax's dynamics, and our own for the continuous mountain car.
 
 Source: Gymnasium 1.3, `gymnasium.envs.classic_control`; gymnax 1.0,
 `gymnax.environments.classic_control`. Step limits and solved rewards of cartpole, acrobot and
-mountain_car_continuous: paper, appendix, fixed hyperparameters. Of the others:
+mountain_car_continuous: paper, appendix, fixed hyperparameters. Those of the other tasks:
 Gymnasium's registry.
 """
 
@@ -33,7 +33,7 @@ class GymnaxEnv(Wrapper[EnvState, EnvParams]):
     def step_env(
         self, key: Array, state: EnvState, action: Array, params: EnvParams
     ) -> Step[EnvState]:
-        return self.env.step_env(key, state, jnp.reshape(action, ()), params)  # also of `[1]`
+        return self.env.step_env(key, state, jnp.reshape(action, ()), params)  # it may be `[1]`
 
 
 @struct.dataclass
@@ -63,10 +63,11 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
         x' &= clip(x + v',\ -1.2,\ 0.6) \\
         r &= 100 [x' \ge 0.45 \wedge v' \ge 0] - 0.1 a^2
 
-    The left wall stops the car: v' = 0 where x' = -1.2 and v' < 0. The goal terminates. The action
-    `[1]` or `[]` is charged as given, before it is clipped, as in Gymnasium.
+    The left wall stops the car: v' = 0 where x' = -1.2 and v' < 0. The goal terminates. As in
+    Gymnasium the action, `[1]` or `[]`, is charged before it is clipped.
 
-    Differs: gymnax's has no stop at that wall, and stops a car that rolls back over the goal.
+    Differs: gymnax does not stop the car at that wall, and stops a car that rolls back over the
+    goal.
     """
 
     def step_env(
@@ -120,7 +121,7 @@ class ClassicTask:
     spec: ClassVar[TaskSpec]
 
     def make(self) -> Task:
-        import gymnax  # a second of CPU time, which a refusal need not spend
+        import gymnax  # a second of CPU time, which bad input should not cost
 
         env, _ = gymnax.make(self.gymnax_id)
         return Task.of(self.spec, name=self.name, env=GymnaxEnv(env, self.spec))
@@ -159,7 +160,7 @@ class MountainCar(ClassicTask):
 
 
 class MountainCarContinuous(ClassicTask):
-    """The car with a force to choose, which is charged; the hilltop is worth 100.
+    """The car with a continuous force, which is charged; the hilltop is worth 100.
 
     MountainCarContinuous-v0.
     """

@@ -1,9 +1,9 @@
 """A gymnax 1.x `Environment` that does not import gymnax.
 
-Importing anything of gymnax imports all its environments, and with them seaborn and pandas, which
-takes a CPU second. The methods are gymnax's and the spaces that they return too, so that code which
-takes an environment of gymnax takes one of ours; only `isinstance` tells them apart. gymnax is
-imported when its spaces are asked for.
+Importing anything of gymnax imports all its environments, and with them seaborn and pandas. That
+takes a CPU second. The methods are gymnax's, and so are the spaces that they return. So code for
+environments of gymnax takes ours too; only `isinstance` tells them apart. gymnax is imported when
+its spaces are asked for.
 """
 
 import dataclasses
@@ -37,16 +37,16 @@ Step = tuple[Array, State, Array, Array, dict[str, Array]]  # obs, state, reward
 class Environment(Generic[State, Params]):
     """An environment whose `step_env` and `reset_env` act on one element.
 
-    A subclass adds `start` and `observe` (or `reset_env`) and `step_env`; where episodes terminate
-    by their states, `is_terminated`, too.
+    A subclass adds `step_env`, and `start` and `observe` (or `reset_env`). It adds `is_terminated`
+    if the state tells whether an episode terminates.
 
     Args:
       spec: its spaces, and the step limit of `default_params`.
-      params: `default_params` but for that limit.
+      params: `default_params` without this limit.
 
     Attributes:
-      spaces: of observations and actions; None in a wrapper, whose methods `observation_space` and
-        `action_space` say.
+      spaces: of observations and actions; None in a wrapper, where the methods `observation_space`
+        and `action_space` give them.
     """
 
     spaces: tuple[Space, Space] | None = None
@@ -78,7 +78,7 @@ class Environment(Generic[State, Params]):
         raise NotImplementedError
 
     def is_terminated(self, state: State, params: Params) -> Bool[Array, ""]:
-        """Whether a state is terminal; False where a step alone can tell, or none is."""
+        """Whether a state is terminal; False if only a step can tell, or if no state is."""
         return jnp.bool_(False)
 
     def is_truncated(self, state: State, params: Params) -> Bool[Array, ""]:
@@ -92,7 +92,7 @@ class Environment(Generic[State, Params]):
         return self.observe(state)
 
     def after(self, state: State, reward: Array, params: Params) -> Step[State]:
-        """What a step returns that leads to this state."""
+        """What `step_env` returns for a step that leads to this state."""
         terminated = self.is_terminated(state, params)
         info = {"discount": jax.lax.select(terminated, 0.0, 1.0)}
         return self.observe(state), state, reward, terminated, info

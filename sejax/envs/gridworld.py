@@ -1,4 +1,4 @@
-"""Grid worlds drawn as maps of characters, and the two of the paper.
+"""Grid worlds drawn as maps of characters, and the paper's two grid worlds.
 
 Source: `docs/reference.md` 6.1 and 6.2.
 """
@@ -47,7 +47,7 @@ class GridParams(EnvParams):
 class GridWorld(Environment[GridState, GridParams]):
     """A deterministic world of cells.
 
-    A move into a wall or off the map stays in place and is paid like the cell it stays in.
+    A move into a wall or off the map leaves the agent in place and earns the reward of its cell.
     Entering the goal or a hole terminates. Observations are the cell's index, `[]` int32.
 
     Example:
@@ -107,10 +107,10 @@ def _next_indices(cells: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class CliffWalking(Options):
-    """Each step costs 1, and stepping off the cliff 100 and the episode.
+    """Each step costs 1; a step off the cliff costs 100 and ends the episode.
 
     Attributes:
-      goal_reward: Of the move into the goal: 0 in the authors' code; -1 in the paper's text.
+      goal_reward: Reward of the move into the goal: 0 in the authors' code; -1 in the paper's text.
 
     Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task";
     `docs/reference.md` 6.1.

@@ -1,6 +1,6 @@
 """Any environment that gymnax knows, by its id: `env=gymnax/MountainCar-v0`.
 
-What agents see is known when it is made: there is no `spec`.
+Its spaces are known only when it is made: there is no `spec`.
 """
 
 import math
@@ -24,11 +24,11 @@ SOLVED_REWARD = {
 
 @dataclass(frozen=True, kw_only=True)
 class GymnaxTask(Options):
-    """One of gymnax's environments as it is, or as another package has registered it there.
+    """An environment of gymnax, or one that another package has registered there.
 
     Attributes:
       solved_reward: mean return that counts as solved; null: Gymnasium's
-      max_steps: null: gymnax's
+      max_steps: step limit; null: gymnax's
 
     Raises:
       ConfigError: when it is made, for an id that gymnax does not know or cannot make.

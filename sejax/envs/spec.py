@@ -1,4 +1,4 @@
-"""What is known of a task without making it: its spaces, limits and thresholds."""
+"""A task's spec: its spaces, limits and thresholds, known without making the task."""
 
 import math
 from collections.abc import Mapping
@@ -48,18 +48,18 @@ Space = Discrete | Box
 class TaskSpec:
     """What is known of a task without making it.
 
-    A task's configuration has one as its attribute `spec`: then settings that do not suit the task
-    are refused before its environment is imported, which can take seconds. A `Task` is one, too.
-    They are compared by identity.
+    A task's configuration may have a spec as its attribute `spec`. Then settings that do not suit
+    the task are refused before its environment is imported, which can take seconds. A `Task` is a
+    spec, too. Specs are compared by identity.
 
     Attributes:
       observation: space of the observations, indices or vectors.
       action: space of the actions: indices, or vectors in [-x, x] for the same x everywhere.
       max_steps: step limit of an episode.
       solved_reward: mean return per episode at which the task counts as solved; inf if undefined.
-      info_keys: entries of a step's `info` that say more of the state than the observation, each
-        `[]`; reward networks can weigh them.
-      augmented_keys: those that describe the state alone, as input for reward networks.
+      info_keys: entries of a step's `info`, each `[]`, that say more than the observation; reward
+        networks can weigh them.
+      augmented_keys: the `info_keys` that describe only the state; reward networks can see them.
     """
 
     observation: Space
@@ -83,7 +83,7 @@ class TaskSpec:
         """What agents see, as plain values that a proxy's file keeps.
 
         `observation` and `action` are `{"n": categories}` or the bounds of a vector, `{"low": [x],
-        "high": [x]}` with None where there is none; `max_steps` is the step limit.
+        "high": [x]}`, with None for no bound; `max_steps` is the step limit.
         """
         return {
             "observation": _plain(self.observation),
@@ -103,7 +103,7 @@ class TaskSpec:
 
     @property
     def is_solvable(self) -> bool:
-        """Whether it is known what counts as solved."""
+        """Whether the task has a solved reward."""
         return math.isfinite(self.solved_reward)
 
     @property

@@ -1,4 +1,4 @@
-"""Environments around another one: actions repeated, partly scored, or all as vectors."""
+"""Wrappers of environments: they repeat actions, score a part of the steps, or make vectors."""
 
 import copy
 import dataclasses
@@ -17,7 +17,7 @@ from sejax.options import require, shortened
 
 
 class Wrapper(Environment[State, Params]):
-    """An environment that is another one but for what a subclass changes."""
+    """An environment that acts as another one; a subclass changes a part."""
 
     def __init__(self, env: Environment):
         self.env = env
@@ -55,7 +55,7 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
 
     Source: paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3" (number of action
     repeats); `docs/reference.md` 1.8. There an SE is stepped on after its episode has ended; here
-    no step is made that cannot count.
+    steps after the end have no effect.
     """
 
     def __init__(self, env: Environment, num_repeats: int):
@@ -80,7 +80,7 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
 
 @cache
 def repeat_actions(env: Environment, num_repeats: int) -> Environment:
-    """The environment in which actions last for `num_repeats` steps; itself for 1."""
+    """The environment in which actions last for `num_repeats` steps; `env` itself for 1."""
     return env if num_repeats == 1 else ActionRepeat(env, num_repeats)
 
 
@@ -95,15 +95,15 @@ class PartParams(EnvParams):
 
 
 class PartlyScored(Wrapper[PartState, PartParams]):
-    """An environment of which the first steps of an episode are scored, or more than all.
+    """An environment that scores an episode's first `scored_steps`, which may exceed its limit.
 
-    Rewards are those within the task's step limit, where a repeated action ends too;
+    The reward is 0 after the task's step limit, where a repeated action ends too.
     `info["scored_reward"]` is the reward of a decision that begins within the scored steps, and 0
     after them. An episode lasts to the later of both limits.
 
     Args:
       env: the environment.
-      params: its own; those of this one are `PartParams`.
+      params: the environment's own params; the wrapper's are `PartParams`.
     """
 
     def __init__(self, env: Environment, params: EnvParams):
@@ -142,7 +142,7 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
     """An environment with float32 vectors as observations and continuous actions in [-1, 1].
 
     Observations of any shape are flattened, row by row; an action `[n]` is scaled linearly to the
-    bounds of the wrapped environment's box and takes its shape. Discrete ones stay as they are.
+    bounds of the wrapped environment's box and takes its shape. Discrete spaces stay as they are.
 
     Args:
       env: the environment.
@@ -187,7 +187,7 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
 
 
 def as_vectors(env: Environment, params: EnvParams) -> Environment:
-    """An environment as agents can take it, itself or in `AsVectors`.
+    """An environment that agents can use: `env` itself, or `env` in `AsVectors`.
 
     Raises:
       ConfigError: for spaces other than boxes and discrete ones, or actions without bounds.
@@ -197,7 +197,7 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
         return env
     shape = env.action_space(params).shape
     has_plain_obs = isinstance(observation, Discrete)
-    if not has_plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
+    if not has_plain_obs:  # a real observation tells; a space may be wrong (gymnax's FourRooms)
         came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
         has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32
     if isinstance(action, Box):
@@ -205,7 +205,7 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
         fix = f"got {shortened(action)}. Give its action space a finite low and high"
         is_bounded = np.isfinite([low, high]).all() and (low < high).all()
         require(is_bounded, "env", f"must have bounded actions; {fix}.")
-        is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # from the same -x to x
+        is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # the same [-x, x] everywhere
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
         return env
     return AsVectors(env, (observation, action), shape)

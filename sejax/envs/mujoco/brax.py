@@ -14,8 +14,8 @@ from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 if TYPE_CHECKING:
     from sejax.envs.mujoco.tasks import HalfCheetah
 
-# Of mjx's line search, where MuJoCo has 50: under vmap all wait for the longest search. With 10
-# gaits are worth as much as with 50, with 8 no longer (docs/mujoco.md).
+# Iterations of mjx's line search; MuJoCo has 50. Under vmap all wait for the longest search. Gaits
+# earn as much with 10 iterations as with 50, but less with 8 (docs/mujoco.md).
 LS_ITERATIONS = 10
 
 
@@ -33,7 +33,7 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
     torques, `[6]` in [-1, 1]. An episode never terminates. `info` has the torso's `x_position` (m),
     its `x_velocity` over the step (m/s), and the reward's parts `reward_run` and `reward_ctrl`.
 
-    Each reset draws an initial state of its own from the key: brax's wrappers, which go back to one
+    Each reset draws its own initial state from the key. brax's wrappers, which go back to one
     cached state, are not used.
 
     Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.

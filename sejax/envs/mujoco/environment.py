@@ -24,19 +24,19 @@ Scalars = dict[str, Float[Array, ""]]
 class MujocoTask(Options):
     """A task of Gymnasium: its options, which are keyword arguments there, and its equations.
 
-    A subclass says what is in the class attributes and in the methods `rewards`, `is_healthy`,
-    `more_info` and `observe`.
+    A subclass sets the class attributes and defines `rewards`, `is_healthy`, `more_info` and
+    `observe`.
 
     Attributes:
       name: of the task.
-      file: of the model, among Gymnasium's.
+      file: the model's file, one of Gymnasium's.
       frame_skip: MuJoCo's steps in one step.
-      num_hidden: positions that are not observed, the first ones.
+      num_hidden: how many positions, from the first on, are not observed.
       with_forces: whether external forces are needed.
-      normal_velocities: whether those of a reset are normal, else uniform.
-      otherwise: what else can be done where MuJoCo cannot be used, for messages.
-      terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some.
-      reset_noise_scale: range or deviation of what is drawn at a reset; an option of some.
+      normal_velocities: whether a reset draws normal velocities; else they are uniform.
+      otherwise: for messages: what helps if MuJoCo cannot be used.
+      terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some tasks
+      reset_noise_scale: range or deviation of a reset's noise; an option of some tasks
     """
 
     group: ClassVar[str] = "env"
@@ -78,13 +78,13 @@ class MujocoTask(Options):
 
     @property
     def physics(self) -> "Physics":
-        """Of the task's model."""
+        """The physics of the task's model."""
         from sejax.envs.mujoco.physics import of_gymnasium
 
         return of_gymnasium(self.file, self.frame_skip, self.with_forces)
 
     def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-        """Positions and velocities of a reset: the model's own pose at rest, and noise.
+        """Positions and velocities of a reset: the model's own pose at rest, plus noise.
 
         Noise is uniform in +-`reset_noise_scale`, or normal with that deviation.
         """
@@ -109,7 +109,7 @@ class MujocoTask(Options):
         raise NotImplementedError
 
     def more_info(self, now: "Report") -> Scalars:
-        """What else is in `info`."""
+        """More entries of `info`."""
         return {}
 
     def velocity(self, now: "Report") -> Float[Array, " axes"]:
@@ -125,8 +125,8 @@ class MujocoState(EnvState):
 class MujocoEnv(Environment[MujocoState, EnvParams]):
     """A task of Gymnasium, equal to it step by step but for rounding to single precision.
 
-    As in Gymnasium, the reward is the sum of the parts that `info` lists, and actions beyond their
-    bounds are clipped by MuJoCo and charged as they are.
+    As in Gymnasium, the reward is the sum of the parts that `info` lists. MuJoCo clips actions
+    beyond their bounds; the reward charges them unclipped.
     """
 
     def __init__(self, task: MujocoTask):

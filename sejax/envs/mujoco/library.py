@@ -1,4 +1,4 @@
-"""The shared library that `step.cc` becomes: built on first use, and kept."""
+"""The shared library of `step.cc`: built on first use, then kept."""
 
 import contextlib
 import ctypes
@@ -25,12 +25,11 @@ _LOADING = threading.Lock()
 
 
 def load() -> ctypes.CDLL:
-    """The library of this process, whose handlers XLA then knows as `TARGETS`.
+    """The library of this process; registers its handlers with XLA as `TARGETS`.
 
-    It is built if it is not in the cache folder (`sejax.ops.files.cache_folder`), which takes some
-    seconds. Processes that build it at the same time do not disturb each other. With the cache
-    switched off, or where it cannot be written or what lies there not be loaded, each process
-    builds its own.
+    If it is not in the cache folder (`sejax.ops.files.cache_folder`), it is built, which takes some
+    seconds. Processes that build it at the same time do not disturb each other. Each process builds
+    its own library if the cache is switched off, cannot be written, or its files cannot be loaded.
 
     Raises:
       ConfigError: if it has to be built and cannot be, or JAX's default device is no CPU; the
@@ -39,7 +38,7 @@ def load() -> ctypes.CDLL:
     got = f"got {jax.default_backend()}. Set JAX_PLATFORMS=cpu"
     if jax.default_backend() != "cpu":
         raise ConfigError(f"must run on the CPU; {got}")
-    with _LOADING:  # XLA takes one library of a process, and no second one
+    with _LOADING:  # XLA takes only one library in a process
         return _load()
 
 
@@ -47,7 +46,7 @@ def load() -> ctypes.CDLL:
 def _load() -> ctypes.CDLL:
     folder = files.cache_folder()
     kept = folder / file_name() if folder else None
-    with contextlib.suppress(OSError):  # as where none lies there yet
+    with contextlib.suppress(OSError):  # as if there is no file yet
         if kept is not None:
             return _register(kept)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
@@ -65,7 +64,7 @@ def _load() -> ctypes.CDLL:
 
 
 def file_name() -> str:
-    """What the library is called: there is one for each version of all that it is made of."""
+    """The library's name, another one for each version of anything that it is built from."""
     versions = f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}"
     source, options = SOURCE.read_text(encoding="utf-8"), (*FLAGS, *compiler()[1:])
     parts = (source, *options, versions, platform.system(), *platform.libc_ver())
@@ -76,11 +75,11 @@ def file_name() -> str:
 def build(path: Path) -> None:
     """Compiles the library.
 
-    The code is for any CPU of this kind: nearly all time passes in MuJoCo, which comes compiled.
-    MuJoCo is bound by its file's name alone, as the process has it loaded already.
+    The code is for any CPU of this architecture: nearly all time passes in MuJoCo, which comes
+    compiled. MuJoCo is linked by its file's name alone, as the process has already loaded it.
 
     Raises:
-      ConfigError: if the compiler is not there, or fails.
+      ConfigError: if the compiler is missing or fails.
     """
     package = Path(mujoco.__file__).parent
     mujoco_library = min(package.glob("libmujoco*"))
@@ -100,7 +99,7 @@ def compiler() -> list[str]:
 
 
 def _register(path: Path) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(path.absolute()))  # else it is searched for where libraries lie
+    library = ctypes.CDLL(str(path.absolute()))  # else the system's folders would be searched
     library.SejaxMujocoRegister.argtypes = [ctypes.c_int64, ctypes.c_void_p]
     library.SejaxMujocoRegister.restype = None
     library.SejaxMujocoLength.argtypes = [ctypes.c_void_p]

@@ -19,18 +19,18 @@ from sejax.envs.mujoco import library
 
 
 class Report(NamedTuple):
-    """What MuJoCo says after a step, in single precision; lengths in m, angles in rad, times in s.
+    """MuJoCo's numbers after a step, in single precision; lengths in m, angles in rad, times in s.
 
     Attributes:
       qpos: `[nq]` positions of the joints.
       qvel: `[nv]` their velocities.
-      qpos_change: `[nq]` by how much the positions differ from those before, which is subtracted
-        in double precision; 0 after a reset.
-      xpos: `[nbody, 3]` positions of the bodies as MuJoCo computed them last, which is before the
-        end of the step: after its start, or after the last of the Runge-Kutta method's stages.
-      xpos_change: `[nbody, 3]` by how much they differ from those that the step before reported.
-      cfrc_ext: `[nbody, 6]` torques and forces from without on each body, in N m and N; 0 after a
-        reset. `[0, 6]` if they are not asked for.
+      qpos_change: `[nq]` change of the positions in the step, subtracted in double precision; 0
+        after a reset.
+      xpos: `[nbody, 3]` positions of the bodies as MuJoCo computed them last. That is before the
+        end of the step: after its start, or after the last stage of the Runge-Kutta method.
+      xpos_change: `[nbody, 3]` change of `xpos` since the previous report.
+      cfrc_ext: `[nbody, 6]` external torques and forces on each body, in N m and N; 0 after a
+        reset. `[0, 6]` without `with_forces`.
     """
 
     qpos: Float[Array, " nq"]
@@ -44,15 +44,15 @@ class Report(NamedTuple):
 class Physics:
     """A model, stepped by MuJoCo on the CPU, in double precision.
 
-    A state is what MuJoCo needs to go on to the same bits (`mjSTATE_INTEGRATION`, and the bodies'
-    positions for the next `Report.xpos_change`): doubles, as pairs of 32-bit words, `[num_words]`.
-    Rounded to single precision it would be another trajectory within a hundred steps.
+    From a state MuJoCo goes on to the same bits. It has `mjSTATE_INTEGRATION`, and the bodies'
+    positions for the next `Report.xpos_change`: doubles, as pairs of 32-bit words, `[num_words]`.
+    A state in single precision would lead to another trajectory within a hundred steps.
 
-    Both functions take one element; under `vmap` a batch is one call, whose elements are stepped
+    `reset` and `step` take one element. Under `vmap` a batch is one call, which steps its elements
     one after the other. Devices step at the same time.
 
     Args:
-      path: of the model's XML, which must stand for itself, without files that it includes.
+      path: the model's XML, which must not include other files.
       frame_skip: MuJoCo's steps in one step.
       with_forces: whether reports have `cfrc_ext`, which takes time.
     """
@@ -60,7 +60,7 @@ class Physics:
     def __init__(self, path: Path, frame_skip: int, with_forces: bool = False):
         self.model = mujoco.MjModel.from_xml_path(str(path))
         self.frame_skip = frame_skip
-        # By its content, so that a compiled program that is kept finds it in another process.
+        # The id comes from the content: a cached program finds the model in another process too.
         digest = hashlib.sha256(path.read_bytes() + version("mujoco").encode()).digest()
         self._id = np.frombuffer(digest, np.int64)[0]
         handlers = library.load()
@@ -88,10 +88,10 @@ class Physics:
     def step(
         self, state: UInt32[Array, " num_words"], ctrl: Float[Array, " nu"]
     ) -> tuple[UInt32[Array, " num_words"], Report]:
-        """`frame_skip` of MuJoCo's steps with the same controls, which it clips to their range.
+        """`frame_skip` steps of MuJoCo with the same controls, which it clips to their range.
 
-        Controls of which one is not a number count as 0, as in MuJoCo. A simulation that explodes
-        begins anew from the model's own pose, as there.
+        As in MuJoCo, all controls count as 0 if one is not a number, and a simulation that explodes
+        begins anew from the model's own pose.
         """
         arguments = state, jnp.asarray(ctrl, jnp.float32)
         return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))

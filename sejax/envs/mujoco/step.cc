@@ -1,13 +1,13 @@
 // MuJoCo behind XLA's foreign function interface: a reset and a step, as pure functions.
 //
-// What MuJoCo needs to go on exactly where it was goes in and comes out, as doubles in pairs of
-// 32-bit words, since JAX has no doubles by default: its integration state, and after it the
-// positions of all bodies as it computed them last, `Length` doubles in all. Those lag behind the
-// joints by a part of a step, and some of Gymnasium's rewards are made of them.
+// A state goes in and comes out, from which MuJoCo goes on exactly where it was: its integration
+// state, then the positions of all bodies as it computed them last, `Length` doubles in all. Each
+// double is a pair of 32-bit words, since JAX has no doubles by default. The positions of bodies
+// lag behind the joints by a part of a step, and some of Gymnasium's rewards are made of them.
 //
 // Leading axes of the arguments are a batch, whose elements are stepped one after the other. Each
-// thread has a workspace (mjData) of its own for each model, and what is left there by one call has
-// no effect on the next.
+// thread has its own workspace (mjData) for each model. What one call leaves there has no effect on
+// the next call.
 
 #include <algorithm>
 #include <cfenv>
@@ -43,7 +43,7 @@ struct Workspace {
   std::unique_ptr<mjData, FreeData> data;
 };
 
-// All models by their numbers. It only grows, and is never destroyed: XLA's threads may outlive it.
+// All models by number. The map only grows, and is never destroyed: XLA's threads may outlive it.
 struct Models {
   std::shared_mutex mutex;
   std::unordered_map<int64_t, const mjModel*> by_id;
@@ -54,7 +54,7 @@ Models& AllModels() {
   return models;
 }
 
-// This thread's workspace for a model; without a model if there is none of that number.
+// This thread's workspace for a model; its model is null if no model has that number.
 Workspace& WorkspaceOf(int64_t id) {
   thread_local std::unordered_map<int64_t, Workspace> workspaces;
   Workspace& found = workspaces[id];
@@ -69,8 +69,8 @@ Workspace& WorkspaceOf(int64_t id) {
   return found;
 }
 
-// XLA lets its threads round denormal numbers to zero; within this scope they are what they are in
-// any other program that calls MuJoCo.
+// XLA lets its threads round denormal numbers to zero. This scope keeps these numbers, as any other
+// program that calls MuJoCo does.
 class DefaultFloatingPoint {
  public:
   DefaultFloatingPoint() {
@@ -83,7 +83,7 @@ class DefaultFloatingPoint {
   std::fenv_t before_;
 };
 
-// MuJoCo prints a warning, and adds it to a log file, where it has not counted one of its kind. A
+// MuJoCo prints and logs the first warning of each kind. Counting one beforehand prevents it: a
 // call has no effect but its result.
 void Silence(mjData* d) {
   for (int i = 0; i < mjNWARNING; ++i) d->warning[i].number = 1;
@@ -101,14 +101,14 @@ std::string Show(Axes axes) {
   return text + "]";
 }
 
-// What is to be an array of shape `[*batch, length]`.
+// An array that must have shape `[*batch, length]`.
 struct Expected {
   const char* name;
   Axes axes;
   int64_t length;
 };
 
-// An error unless all arrays have their lengths, and the same axes before.
+// An error unless all arrays have their lengths, and the same leading axes.
 ffi::Error Check(std::initializer_list<Expected> arrays) {
   Axes first = arrays.begin()->axes;
   for (const auto& [name, axes, length] : arrays) {
@@ -131,9 +131,9 @@ ffi::Error Unknown(int64_t id) {
                         ". Make the task before a program is run that was compiled for it");
 }
 
-// What a call gives back of each element of the batch: the state, and a report of single-precision
-// numbers, one group after the other: qpos, qvel, the change of qpos, xpos, the change of xpos, and
-// if there is room for it, cfrc_ext, whose computation takes time.
+// A call's results for each element of the batch: the state, and a report of single-precision
+// numbers. The report has qpos, qvel, the change of qpos, xpos, the change of xpos, and if there is
+// room for it, cfrc_ext, whose computation takes time.
 class Results {
  public:
   Results(const mjModel* m, Words state, Floats report) : m_(m), state_(state), report_(report) {
@@ -147,7 +147,7 @@ class Results {
     return {"the report", report_.dimensions(), ReportLength(has_forces_)};
   }
 
-  // Writes element `b`: MuJoCo as it is, and what changed.
+  // Writes element `b`: MuJoCo's state, and its report with the changes.
   void Write(int64_t b, const mjData* d, const mjtNum* qpos_before, const mjtNum* xpos_before) {
     mjtNum* state = reinterpret_cast<mjtNum*>(state_.typed_data()) + b * Length(m_);
     mj_getState(m_, d, state, kState);
@@ -166,7 +166,7 @@ class Results {
     return 2 * m_->nq + m_->nv + (has_forces ? 12 : 6) * m_->nbody;
   }
 
-  // Subtracted before it is rounded: velocities would be lost far from the origin otherwise.
+  // Subtracts before it rounds: velocities would be lost far from the origin otherwise.
   static float* PutChange(const mjtNum* now, const mjtNum* before, int64_t count, float* out) {
     return std::transform(now, now + count, before, out, std::minus<mjtNum>());
   }
@@ -177,7 +177,7 @@ class Results {
   bool has_forces_;
 };
 
-// As Gymnasium's reset: a new simulation but for its positions and velocities.
+// As Gymnasium's reset: a new simulation with these positions and velocities.
 ffi::Error Reset(int64_t id, Floats qpos, Floats qvel, ffi::Result<Words> state,
                  ffi::Result<Floats> report) {
   Workspace& workspace = WorkspaceOf(id);
@@ -226,7 +226,7 @@ ffi::Error Step(int64_t id, int64_t frame_skip, Words state, Floats ctrl, ffi::R
     const float* control = ctrl.typed_data() + b * m->nu;
     std::copy_n(control, m->nu, d->ctrl);
     for (int64_t i = 0; i < frame_skip; ++i) {
-      Silence(d);  // again, as a simulation that begins anew forgets what it has counted
+      Silence(d);  // again, as a simulation that begins anew forgets its counts
       mj_step(m, d);
     }
     if (results.has_forces()) mj_rnePostConstraint(m, d);
@@ -237,7 +237,7 @@ ffi::Error Step(int64_t id, int64_t frame_skip, Words state, Floats ctrl, ffi::R
 
 }  // namespace
 
-// Keeps a copy of a model under a number; one that is there stays.
+// Keeps a copy of a model under a number, unless the number already has a model.
 extern "C" void SejaxMujocoRegister(int64_t id, const mjModel* model) {
   Models& all = AllModels();
   std::unique_lock lock(all.mutex);

@@ -1,10 +1,10 @@
 """Gymnasium's MuJoCo tasks, v5.
 
-Step limits and solved rewards are those of Gymnasium's registry where nothing else is said; options
-are Gymnasium's keyword arguments. MuJoCo, its extra `mujoco` and a C++ compiler are needed when a
-task is made.
+Step limits and solved rewards are those of Gymnasium's registry unless a task says otherwise.
+Options are Gymnasium's keyword arguments. Making a task needs MuJoCo, from the extra `mujoco`, and
+a C++ compiler.
 
-Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
+Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, version 5 of each task.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from sejax.options import ConfigError, Finite, NonNegative
 if TYPE_CHECKING:  # it imports mujoco
     from sejax.envs.mujoco.physics import Report
 
-# The entries of `info` that describe the state alone; an observation has no position along x or y.
+# The entries of `info` that describe only the state; an observation has no position along x or y.
 _STATE_KEYS = ("x_position", "y_position", "x_velocity", "y_velocity")
 _ON_A_LINE = ("x_position", "x_velocity")
 _REWARD_KEYS = ("reward_forward", "reward_ctrl")
@@ -67,8 +67,8 @@ class HalfCheetah(MujocoTask):
 
     Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
 
-    Differs: `info` has the name of v3, `reward_run`, for what v5 calls `reward_forward`, as sejax's
-    other physics do.
+    Differs: in `info`, `reward_forward` of v5 is called `reward_run`, as in v3 and in sejax's other
+    physics.
     """
 
     name = "halfcheetah"
@@ -104,7 +104,7 @@ class HalfCheetah(MujocoTask):
 
 @dataclass(frozen=True, kw_only=True)
 class Runner(MujocoTask):
-    """What the tasks have in common that pay for moving along x and charge for torque."""
+    """The common part of tasks that pay for moving along x and charge for torque."""
 
     forward_reward_weight: Finite = 1.0
     ctrl_cost_weight: NonNegative = 1e-3
@@ -117,7 +117,7 @@ class Runner(MujocoTask):
         }
 
     def more_info(self, now: "Report") -> Scalars:
-        """Of a body that moves in a plane; x and y are the first axes."""
+        """The entries for a body that moves in a plane; x and y are the first axes."""
         velocity = self.velocity(now)
         return {
             "x_position": now.qpos[0],
@@ -134,9 +134,9 @@ class Hopper(Runner):
 
     .. math:: r = v_x + 1 - 0.001 \lVert a \rVert^2
 
-    It has fallen, which terminates, below a height of 0.7 m, at an angle beyond 0.2 rad, or where
-    another number of the state is beyond 100. Observations are the positions without x and all
-    velocities, clipped to [-10, 10], `[11]`; actions torques, `[3]`.
+    A fall terminates: a height below 0.7 m, an angle beyond 0.2 rad, or another number of the state
+    beyond 100. Observations are the positions without x and all velocities, clipped to [-10, 10],
+    `[11]`; actions torques, `[3]`.
     """
 
     name = "hopper"
@@ -173,7 +173,7 @@ class Walker2d(Hopper):
 
     .. math:: r = v_x + 1 - 0.001 \lVert a \rVert^2
 
-    It has fallen, which terminates, outside heights of 0.8 to 2 m or at an angle beyond 1 rad.
+    A fall terminates: a height outside of 0.8 to 2 m, or an angle beyond 1 rad.
     Observations are as the hopper's, `[17]`; actions torques, `[6]`.
 
     Gymnasium has no reward threshold for it. The solved reward is our choice, below the 4,683 that
@@ -212,8 +212,8 @@ class Swimmer(Runner):
 class InvertedPendulum(MujocoTask):
     """A pole on a cart that is paid 1 for each step after which it stands.
 
-    It has fallen, which terminates, at an angle beyond 0.2 rad. Observations are positions and
-    velocities, `[4]`; the action is a force on the cart, `[1]` in [-3, 3].
+    A fall terminates: an angle beyond 0.2 rad. Observations are positions and velocities, `[4]`;
+    the action is a force on the cart, `[1]` in [-3, 3].
     """
 
     name = "inverted_pendulum"
@@ -240,10 +240,10 @@ class Ant(Runner):
 
     .. math:: r = v_x + 1 - 0.5 \lVert a \rVert^2 - 5 \cdot 10^{-4} \lVert F \rVert^2
 
-    where F are the forces from without on all bodies, clipped to [-1, 1]. It terminates outside
-    heights of 0.2 to 1 m. Observations are the positions without x and y, all velocities and, with
-    `include_cfrc_ext_in_observation`, F, `[105]` or `[27]`; actions torques, `[8]`. As in
-    Gymnasium, the velocity is that of the torso as MuJoCo computed it last, a part of a step ago.
+    where F are the external forces on all bodies, clipped to [-1, 1]. It terminates outside heights
+    of 0.2 to 1 m. Observations are the positions without x and y and all velocities, `[27]`; with
+    `include_cfrc_ext_in_observation` also F, `[105]`. Actions are torques, `[8]`. As in Gymnasium,
+    the velocity is that of the torso as MuJoCo computed it last, a part of a step ago.
 
     Attributes:
       include_cfrc_ext_in_observation: external forces on each body
@@ -275,7 +275,7 @@ class Ant(Runner):
         obs = super().observe(now)
         if not self.include_cfrc_ext_in_observation:
             return obs
-        return jnp.concatenate([obs, _forces(now)[1:].ravel()])  # the world itself feels none
+        return jnp.concatenate([obs, _forces(now)[1:].ravel()])  # the first body is the world
 
     def is_healthy(self, now: "Report") -> Bool[Array, ""]:
         finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
@@ -306,7 +306,7 @@ class Reacher(MujocoTask):
     .. math:: r = -\lVert x - x_{target} \rVert - \lVert a \rVert^2
 
     It never terminates. Observations are cosine and sine of the joints' angles, the target, the
-    joints' velocities, and what is between tip and target, `[10]`; actions torques, `[2]`.
+    joints' velocities, and the vector from target to tip, `[10]`; actions torques, `[2]`.
     """
 
     name = "reacher"
@@ -321,7 +321,7 @@ class Reacher(MujocoTask):
 
     def draw_start(self, key: Array) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
         key_arm, key_speed, key_distance, key_angle = jax.random.split(key, 4)
-        # Uniform in the disc, where Gymnasium draws from the square until it has hit the disc.
+        # Uniform in the disc; Gymnasium draws from the square until it hits the disc.
         distance = _RADIUS * jnp.sqrt(jax.random.uniform(key_distance))
         angle = 2 * jnp.pi * jax.random.uniform(key_angle)
         target = distance * jnp.array([jnp.cos(angle), jnp.sin(angle)])
