@@ -1,11 +1,10 @@
-"""Stored proxies for Gymnasium and Stable-Baselines3, in NumPy: any agent.
+"""Stored proxies for the agents of Gymnasium and Stable-Baselines3, in NumPy.
 
 `make` makes an environment of a synthetic environment (SE) or a reward network (RN), `make_vec` and
 `make_sb3` vector environments, and `RewardNetwork` puts an RN around an environment that you have.
-Importing this registers what ships with the package, as `sejax/<name>`; Gymnasium imports it for
-`sejax.gym:sejax/<name>`, in other processes too. No backend of JAX starts, so that environments
-fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`. How to use it
-all: docs/gymnasium.md.
+Importing this module registers the shipped proxies as `sejax/<name>`. Gymnasium imports it for
+`sejax.gym:sejax/<name>`, in other processes too. It starts no backend of JAX, so environments fork
+and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`. How to use it: docs/gymnasium.md.
 
 Example:
   >>> import gymnasium

@@ -8,13 +8,13 @@ from scipy.linalg import block_diag
 
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
 
-# Activations that are computed at once. Arrays of 96 KB stay in the cache, and below the size from
-# which C's allocator asks the system for fresh pages each time, which took ten times the product.
+# Activations that are computed at once. Arrays of 96 KB stay in the cache. C's allocator asks the
+# system for fresh pages for larger arrays each time, which took ten times as long as the product.
 BLOCK = 24 * 1024
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,
-    "fast_tanh": np.tanh,  # which differs by at most 1.4e-6
+    "fast_tanh": np.tanh,  # they differ by at most 1.4e-6
     "relu": lambda x: np.maximum(x, 0),
     "leaky_relu": lambda x: np.maximum(x, 0.01 * x),
     "prelu": lambda x: np.maximum(x, 0.25 * x),  # the slope that proxies keep
@@ -40,16 +40,16 @@ def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
 
 
 def layers_of(weights: Mapping[str, np.ndarray], network: str) -> Layers:
-    """A network's layers, none if it is not there; files hold kernels as `[out, in]`."""
+    """A network's layers, empty if the network is missing; files hold kernels as `[out, in]`."""
     names = (f"{network}/Dense_{i}" for i in itertools.count())
     there = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)
     return [(weights[f"{name}/kernel"].T, weights[f"{name}/bias"]) for name in there]
 
 
 def joined(networks: Sequence[Layers]) -> Layers:
-    """Networks of the same input as one, whose outputs are theirs one after the other.
+    """Joins networks of the same input into one, which gives their outputs one after the other.
 
-    One product over the zeros between the blocks takes less time than three small ones.
+    One product with zeros between the blocks takes less time than three small products.
     """
     whole: Layers = []
     for parts in zip(*networks, strict=True):
@@ -60,7 +60,7 @@ def joined(networks: Sequence[Layers]) -> Layers:
 
 
 def shapes_of(networks: Mapping[str, Sequence[int]]) -> dict[str, tuple[int, ...]]:
-    """Shapes of networks' tensors in a file, by the numbers of inputs and of each layer's units.
+    """Shapes of networks' tensors in a file, given the numbers of inputs and of layers' units.
 
     Example:
       >>> shapes_of({"reward": [6, 1]})

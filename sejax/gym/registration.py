@@ -28,15 +28,15 @@ def make(
     Args:
       source: a run directory, a safetensors file of one proxy, or the name of one that ships with
         the package.
-      task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
-        both know. Episodes of an SE keep the step limit in its file. An RN needs an id here;
+      task: the real task, or its id in Gymnasium; needed unless sejax and Gymnasium both know the
+        task. Episodes of an SE keep the step limit in its file. An RN needs an id here;
         `RewardNetwork` wraps any environment.
       render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
         it.
 
     Raises:
-      ConfigError: if there is no such file, it is damaged, it holds several proxies or one that is
-        JAX code, or its task is not known.
+      ConfigError: if the file is missing or damaged, if it holds several proxies or a proxy that is
+        JAX code, or if its task is unknown.
 
     Example:
       >>> make("acrobot").observation_space.shape
@@ -66,7 +66,7 @@ def make_vec(
       source: as of `make`.
       num_envs: number of environments.
       task: as of `make`.
-      autoreset_mode: what happens where an episode ends; see `SyntheticVectorEnv`.
+      autoreset_mode: what happens when an episode ends; see `SyntheticVectorEnv`.
 
     Raises:
       ConfigError: as `make`, or for less than one environment.
@@ -115,8 +115,8 @@ def register() -> list[str]:
     """Registers the shipped proxies as `sejax/<name>`; importing `sejax.gym` does it.
 
     Returns:
-      The ids for `gymnasium.make` and `gymnasium.make_vec`, which import this package first: in the
-      processes of vector environments too.
+      The ids for `gymnasium.make` and `gymnasium.make_vec`. By these ids Gymnasium imports this
+      package first, in the processes of vector environments too.
 
     Example:
       >>> register()[0], gymnasium.make("sejax.gym:sejax/acrobot").action_space
@@ -137,7 +137,7 @@ def register() -> list[str]:
 def _read(
     source: Source, task: RealTask | str | None, num_envs: int = 1
 ) -> tuple[Header, SyntheticWorld | None]:
-    """The header of a file, and its SE; None if it is an RN.
+    """The header of a file, and its SE, or None for an RN.
 
     Raises:
       ConfigError: as `make`.

@@ -21,31 +21,32 @@ from sejax.proxies.header import Header, check_tensors, configured, read
 from sejax.proxies.reward import RewardConfig
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
-GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise
+GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` with another name there
 
 
 class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    r"""An environment whose reward is made by an RN; see `sejax.proxies.reward.RewardEnv`.
+    r"""An environment whose reward an RN makes; see `sejax.proxies.reward.RewardEnv`.
 
-    Dynamics, spaces, starts and ends are the environment's own; with r its reward and
-    :math:`\Phi` the network, agents get r or 0 (additive or exclusive) plus
-    :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential,
-    non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the
-    episode has terminated and 1 elsewhere. A reward that is not finite, or whose learned part is
-    beyond 1e6, is 0 and terminates.
+    Dynamics, spaces, starts and ends are the environment's own. Let r be the environment's reward
+    and :math:`\Phi` the network. Agents get a sum. Its first part is r (additive) or 0 (exclusive).
+    Its learned part is :math:`\gamma \Phi(s') - \Phi(s)` (potential), :math:`\Phi(s')`
+    (non-potential) or :math:`w^\top i'` (weighted info). `info["real_reward"]` is r.
+    `info["discount"]` is 0 if the episode has terminated, else 1. A reward that is not finite, or
+    whose learned part is beyond 1e6, becomes 0 and terminates.
 
-    A gamma belongs to a potential, and it is the agent's: the default is that of the agent which
-    the RN was learned with.
+    A potential needs the agent's gamma. The default is the gamma of the agent that the RN was
+    learned with.
 
     Args:
-      env: of the RN's task, its step limit included (`gymnasium.make` sees to it). Wrappers that
-        change observations or rewards go around this one, as the network knows the task's own.
+      env: an environment of the RN's task with its step limit, as `gymnasium.make` gives it.
+        Wrappers that change observations or rewards go around this one: the network knows those of
+        the task.
       source: a run directory, a safetensors file of one RN, or the name of one that ships with the
         package.
       discount: gamma of the agent that will train.
 
     Raises:
-      ConfigError: if the environment is not of the RN's task as far as its spaces tell.
+      ConfigError: if the environment's spaces or wrappers do not fit the RN's task.
 
     Example:
       >>> env = RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount=0.98)
@@ -63,7 +64,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         discount = header.discount if discount is None else discount
         self.discount = checked([discount], Fraction, "discount", header.discount)
         weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()
-        if weighs_info or self.config.augmented:  # of which the task's configuration tells
+        if weighs_info or self.config.augmented:  # the task's configuration has the keys
             spec = envs.spec_of(configured("env", header.config["env"], header.task))
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
@@ -85,7 +86,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode of the environment."""
         obs, info = self.env.reset(seed=seed, options=options)
-        # v is 0 before the first step, as in JAX.
+        # The numbers of `info` are 0 before the first step, as in JAX.
         self._potential = self.potential(obs, np.zeros(len(self._info_keys), np.float32))
         return obs, info
 
@@ -93,7 +94,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """One step of the environment, with the RN's reward.
 
         Raises:
-          KeyError: if `info` lacks what the RN weighs or sees.
+          KeyError: if `info` lacks an entry that the RN weighs or sees.
         """
         obs, real_reward, terminated, truncated, info = self.env.step(action)
         real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
@@ -107,7 +108,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return obs, reward, terminated, truncated, info
 
     def potential(self, obs: np.ndarray, info_values: np.ndarray | tuple[()] = ()) -> float:
-        """Phi of an observation, and of the numbers of `info` that the network sees."""
+        """Phi of an observation and of the numbers of `info` that the network sees."""
         if self._table is not None:
             return self._table[obs]
         if not self._layers:
@@ -120,7 +121,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self.config.output_scale * outputs[..., 0]
 
     def _bonus(self, obs: np.ndarray, info_values: np.ndarray, terminated: bool) -> float:
-        """What a transition is worth beside the real reward."""
+        """The learned part of a transition's reward."""
         if self._weights is not None:
             return float(self._weights @ info_values)
         before, self._potential = self._potential, self.potential(obs, info_values)
@@ -129,15 +130,15 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
 
 def _require_task(env: Env, header: Header) -> None:
-    """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
+    """Checks that an environment's spaces and wrappers fit the task of a file."""
     layers = [env]  # the innermost last
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    must = f"must be sejax's {shortened(header.task, 40)}, its observations changed by no wrapper"
+    must = f"must be sejax's {shortened(header.task, 40)}; no wrapper may change its observations"
     is_same = (
-        not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, whose rules are others
+        not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, which has other rules
         and _signature(env.observation_space) == _signature(learned.observation_space)
         and _signature(env.unwrapped.action_space) == _signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)

@@ -13,11 +13,11 @@ class SyntheticVecEnv(DummyVecEnv):
     """Episodes of an SE side by side; each step is one pass through its networks.
 
     As in Stable-Baselines3's own, an environment whose episode has ended begins the next one in
-    the same step: `infos[i]["terminal_observation"]` is where the old one ended, and
-    `infos[i]["TimeLimit.truncated"]` says whether it was merely cut. Environment i is that of
-    `sejax.gym.make` after `reset(seed=seed + i)`.
+    the same step. `infos[i]["terminal_observation"]` is the last observation of the old episode,
+    and `infos[i]["TimeLimit.truncated"]` says whether its time limit cut it. Environment i equals
+    that of `sejax.gym.make` after `reset(seed=seed + i)`.
 
-    `get_attr`, `set_attr` and `env_method` ask environments that take no steps.
+    `get_attr`, `set_attr` and `env_method` reach other environments, which take no steps.
 
     Args:
       world: of the SE.
@@ -32,7 +32,7 @@ class SyntheticVecEnv(DummyVecEnv):
         """First observations, `[num_envs, ...]`, with the seeds of the last call of `seed`."""
         obs, _ = self._episodes.reset(seed=self._seeds[0])
         self._reset_seeds()
-        self._reset_options()  # which have no effect
+        self._reset_options()  # options have no effect
         return obs
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:  # type: ignore[override]

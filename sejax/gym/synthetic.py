@@ -1,4 +1,4 @@
-"""Synthetic environments (SEs) in NumPy: the world that one is, and one episode in it at a time."""
+"""Synthetic environments (SEs) in NumPy: the networks, and one episode or many side by side."""
 
 import copy
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ LIMIT = np.float32(MAX_ABS_VALUE)
 
 
 class SyntheticWorld:
-    """The networks of an SE, and what it has of its task; it has no state.
+    """The networks of an SE, and the part of its task that it uses; without a state.
 
     It is `sejax.proxies.synthetic.SyntheticEnv` in NumPy. Its functions take one episode, or
     a batch of them along a first axis.
@@ -35,7 +35,7 @@ class SyntheticWorld:
     Args:
       weights: by `network/layer/parameter`, kernels `[out, in]` and biases `[out]`, float32.
       config: of the SE.
-      task: what it takes from the real task.
+      task: the part of the real task that the SE uses.
 
     Attributes:
       observation_space: of one episode: a `Box` without bounds, or the task's own `Discrete`.
@@ -45,7 +45,7 @@ class SyntheticWorld:
       draws_noise: whether initial states are made of noise, and not drawn from the real task.
 
     Raises:
-      ConfigError: if the weights are not those of such networks.
+      ConfigError: if the weights do not fit these networks, or if `task` must have `starts`.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], config: SyntheticConfig, task: RealTask):
@@ -67,11 +67,11 @@ class SyntheticWorld:
         self._layers = networks.joined(heads)
         must = "must draw initial states; got None. Set RealTask(starts=...)."
         require(self.draws_noise or task.starts, "task.starts", must)
-        self._starts: Any = task.starts  # not None if it is called
+        self._starts: Any = task.starts  # not None where it is called
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """What the first states of `count` episodes are made of, `[count, obs_dim]` float32."""
+        """Draws noise or real states for `count` first states, `[count, obs_dim]` float32."""
         if self.draws_noise:
             return rng.standard_normal((count, self.obs_dim), np.float32)
         starts = [self._starts(rng) for _ in range(count)]
@@ -80,7 +80,7 @@ class SyntheticWorld:
         return np.array(starts, np.float32)
 
     def first(self, drawn: np.ndarray) -> np.ndarray:
-        """First states `[*batch, obs_dim]`, of what `draw` has drawn."""
+        """First states `[*batch, obs_dim]`, made from the numbers that `draw` has drawn."""
         if not self.draws_noise:
             return drawn
         vector = drawn
@@ -98,7 +98,7 @@ class SyntheticWorld:
           space: the task's, or a batch of it.
 
         Raises:
-          gymnasium.error.InvalidAction: for an action that is none of the space's.
+          gymnasium.error.InvalidAction: for an index or a shape that the space does not have.
         """
         if isinstance(self.action_space, spaces.Discrete):
             array = np.asarray(action)
@@ -117,18 +117,18 @@ class SyntheticWorld:
         Args:
           vector: the state, `[*batch, obs_dim]`.
           action: from `encode`, `[*batch, action_dim]`.
-          time: steps of the episode with this one, `[*batch]`.
+          time: steps of the episode, including this one, `[*batch]`.
           chance: uniform in [0, 1), `[*batch]`, if `draws_ends`.
 
         Returns:
           `(vector, reward, terminated, truncated, discount)`: the next state, `[*batch, obs_dim]`;
-          the others `[*batch]`, of one episode numbers.
+          the others `[*batch]`, or numbers for one episode.
         """
         outputs = self._predict(action, vector)  # [*batch, obs_dim + 2]
         absurd: Any = False
-        if not np.abs(outputs).max() < MAX_ABS_VALUE:  # nan is not either
+        if not np.abs(outputs).max() < MAX_ABS_VALUE:  # also true for nan
             absurd = ~(np.abs(outputs).max(axis=-1) < MAX_ABS_VALUE)
-            outputs[absurd, :-2] = vector[absurd]  # where it was, without a reward
+            outputs[absurd, :-2] = vector[absurd]  # the state stays, without a reward
             outputs[absurd, -2:] = 0, 1
         reward, done = outputs[..., -2], outputs[..., -1]
         if outputs.ndim == 1:  # one at a time, Python's numbers are quicker than NumPy's
@@ -171,16 +171,17 @@ class SyntheticWorld:
 class SyntheticGymEnv(gymnasium.Env[Any, Any]):
     """An SE: small networks that make the next state, the reward and the end of an episode.
 
-    Observations are float32 vectors without bounds, since a learned world need not stay where the
-    real one does; or, for tasks of discrete states, the index of the state vector's largest entry.
+    Observations are float32 vectors without bounds, since a learned world may leave the bounds of
+    the real one. For tasks of discrete states they are the index of the state vector's largest
+    entry.
 
-    An episode is *terminated* where the done output d says so (`config.done`), at the step
-    `config.min_steps` at the earliest; where its horizon ends it (`config.horizon`); or where an
-    output is not finite or beyond 1e6, which also costs the step its
-    reward and leaves the state where it was. It is *truncated* at the task's step limit, here and
-    not by a wrapper. `info["discount"]` is what the agents that an SE was learned with bootstrap
-    with: 0 where the episode has terminated and 1 elsewhere, save in an SE with `done=soft`, where
-    it is 1 - d. Such an SE teaches through that number, which Gymnasium's agents do not see.
+    An episode is *terminated* if the done output d says so (`config.done`), at the step
+    `config.min_steps` at the earliest, or at its horizon (`config.horizon`). It is also terminated
+    if an output is not finite or beyond 1e6; then the reward is 0 and the state stays. It is
+    *truncated* at the task's step limit, by this class and not by a wrapper. `info["discount"]` is
+    the factor with which sejax's agents bootstrap: 0 if the episode has terminated, else 1. In an
+    SE with `done=soft` it is 1 - d; such an SE teaches through this factor, which Gymnasium's
+    agents do not see.
 
     Args:
       world: of the SE.
@@ -189,7 +190,7 @@ class SyntheticGymEnv(gymnasium.Env[Any, Any]):
     def __init__(self, world: SyntheticWorld):
         self.world = world
         self.observation_space = world.observation_space
-        self.action_space = copy.deepcopy(world.action_space)  # its sampler is this one's
+        self.action_space = copy.deepcopy(world.action_space)  # with its own sampler
         self._vector: np.ndarray | None = None  # [obs_dim]: what the networks see and predict
         self._time = 0
 
@@ -205,8 +206,8 @@ class SyntheticGymEnv(gymnasium.Env[Any, Any]):
 
         Raises:
           gymnasium.error.ResetNeeded: if no episode is running.
-          gymnasium.error.InvalidAction: for an action that is none of the space's. Continuous ones
-            are clipped to its bounds, as in Gymnasium's own environments.
+          gymnasium.error.InvalidAction: for an index or a shape that the space does not have.
+            Continuous actions are clipped to its bounds, as in Gymnasium's own environments.
         """
         if self._vector is None:
             raise ResetNeeded("call reset() first: no episode is running")
@@ -223,16 +224,16 @@ class SyntheticGymEnv(gymnasium.Env[Any, Any]):
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """Episodes of an SE as a Gymnasium vector environment.
 
-    Environment i equals `SyntheticGymEnv` after `reset(seed=seed + i)` up to rounding, whatever
-    happens in the others: each has a generator of its own, which draws its starts and ends. Infos,
-    and what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
+    Environment i equals `SyntheticGymEnv` after `reset(seed=seed + i)` up to rounding. The others
+    do not affect it: each has its own generator, which draws its starts and ends. Infos and resets
+    are those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
       world: of the SE.
       num_envs: number of environments.
       autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
-        or SameStep (the end's step returns the next episode's first observation, and the last
-        one's own as `infos["final_obs"]`).
+        or SameStep (the step that ends an episode returns the next one's first observation, and its
+        own last observation in `infos["final_obs"]`).
     """
 
     def __init__(
@@ -251,10 +252,10 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._times = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
         self._generators: list[np.random.Generator] = []  # from the first reset on
-        # A generator gives the same numbers one by one and all at once, which is quicker.
+        # Drawing many numbers at once is quicker; a generator gives the same ones as one by one.
         num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
-        self._num_used = np.full(num_envs, num_drawn)  # of those
+        self._num_used = np.full(num_envs, num_drawn)  # of the drawn starts
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
@@ -262,13 +263,13 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         """Begins an episode in each environment.
 
         Args:
-          seed: of the first environment; the next ones have the numbers that follow.
+          seed: of the first environment; the others have seed + 1, seed + 2, ...
           options: have no effect.
         """
         if seed is not None or not self._generators:
             seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
             self._generators = [seeding.np_random(number)[0] for number in seeds]
-            self._num_used[:] = self._drawn.shape[1]  # what they had drawn before is void
+            self._num_used[:] = self._drawn.shape[1]  # starts drawn before are void
         self._ended = np.zeros(self.num_envs, np.bool_)
         self.begin(~self._ended)
         return self.observe(), {}
@@ -280,7 +281,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
 
         Raises:
           gymnasium.error.ResetNeeded: before the first reset.
-          gymnasium.error.InvalidAction: for actions that are none of the space's.
+          gymnasium.error.InvalidAction: for indices or a shape that the space does not have.
         """
         on = ~self._ended  # the others begin an episode
         rewards, terminated, truncated, discounts = self.advance(actions)
@@ -328,7 +329,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         return rewards, terminated, truncated, discounts
 
     def begin(self, mask: np.ndarray) -> None:
-        """Puts environments at the beginning of an episode."""
+        """Begins an episode in the environments of the mask."""
         indices = np.flatnonzero(mask)
         num_drawn = self._drawn.shape[1]
         if not indices.size:
@@ -342,5 +343,5 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
 
 
 def _infos(discounts: np.ndarray, mask: np.ndarray) -> Info:
-    """Discounts of some environments in Gymnasium's form of infos; empty if of none."""
+    """Discounts of the environments of a mask, in Gymnasium's form of infos; empty for none."""
     return {"discount": np.where(mask, discounts, 0.0), "_discount": mask} if mask.any() else {}

@@ -37,20 +37,20 @@ GYMNASIUM_IDS = {
 GRIDS = ("cliff_walking", "gridworld_2x2")
 
 Env = gymnasium.Env[Any, Any]
-Info = dict[str, Any]  # of a reset or a step; and what a reset is told
+Info = dict[str, Any]  # of a reset or a step; also the options of a reset
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealTask:
-    """What an SE takes from the task that it stands in for.
+    """The part that an SE uses of the task that it stands in for.
 
     Attributes:
       observation_space: a `Box` of vectors, or `Discrete`. An SE uses the bounds of a `Box` only
         for its units (`state_units=bounds`).
       action_space: a `Discrete`, or a `Box` of vectors.
       max_steps: steps after which an episode is truncated, if the SE has no horizon of its own.
-      starts: draws the first observation of an episode with a generator; must be picklable for the
-        environment to be. None if the SE has learned its initial states.
+      starts: draws the first observation of an episode with a generator. The environment can be
+        pickled only if it can. None if the SE has learned its initial states.
     """
 
     observation_space: spaces.Space[Any]
@@ -82,30 +82,30 @@ class RealTask:
 
 
 def _first_observation(env: Env, rng: np.random.Generator) -> Any:
-    """That of an environment's episode, as its wrappers show it."""
+    """The first observation of an episode, as the environment's wrappers show it."""
     env.unwrapped.np_random = rng
     return env.reset()[0]
 
 
 def real_env(header: Header, **options: Any) -> Env:
-    """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same.
+    """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same task.
 
     Args:
       header: of the file.
       **options: of `gymnasium.make`, such as `render_mode`.
 
     Raises:
-      ConfigError: if there is none, or for an option that the task does not have here.
+      ConfigError: if neither has it, or for an option that the task does not have here.
       gymnasium.error.Error: if Gymnasium cannot make it.
     """
     config, limit = header.config["env"], header.spec.max_steps
     name = str(config.get("name"))
     is_known = name in GYMNASIUM_IDS or name in GRIDS
-    # Gymnasium takes more options, such as the path of a model: what a file says is read by the
-    # fields that the task has here.
+    # Gymnasium takes more options, such as the path of a model. A file may set only the fields that
+    # the task has here.
     fields = to_plain(registry.configure("env", config)) if is_known else {}
-    is_known &= fields.pop("backend", "mujoco") != "spring"  # whose dynamics are others
-    must = "must be given, because Gymnasium has none that is the same"
+    is_known &= fields.pop("backend", "mujoco") != "spring"  # it has other dynamics
+    must = "must be given, because Gymnasium does not have the same task"
     fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
     require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")
     if name in GRIDS:
@@ -114,16 +114,16 @@ def real_env(header: Header, **options: Any) -> Env:
 
 
 def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None) -> RealTask:
-    """What an SE takes from its task: from its file if that is enough.
+    """The part that an SE uses of its task, from its file if that is enough.
 
     Args:
       header: of the file.
       config: of the SE.
-      task: one that is given, or its id in Gymnasium; None for the file's.
+      task: the user's task, or its id in Gymnasium; None for the file's.
 
     Raises:
-      ConfigError: if it must be given, or the one given has other actions or another step limit
-        than the file's.
+      ConfigError: if the task must be given, or if it has other actions or another step limit than
+        the file's.
     """
     learned = RealTask.of_spec(header.spec)
     limit = learned.max_steps
@@ -153,8 +153,8 @@ class GridWorld(gymnasium.Env[int, int]):
     LEFT, 2 DOWN, 3 UP. Entering the goal or a hole (the cliff) terminates; a move off the map stays
     in place. There is no step limit (see `sejax.gym.make`), and no picture.
 
-    Gymnasium's `CliffWalking-v1` is another task on the same map: its actions are 0 UP, 1 RIGHT, 2
-    DOWN, 3 LEFT, whoever falls off the cliff goes on from the start, and the move into the goal
+    Gymnasium's `CliffWalking-v1` is another task on the same map. Its actions are 0 UP, 1 RIGHT, 2
+    DOWN, 3 LEFT. An agent that falls off the cliff goes on from the start. The move into the goal
     costs 1 like any other.
 
     Args:
