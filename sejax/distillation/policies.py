@@ -71,7 +71,7 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
         `[state, obs_dim]` to actions; or the name of an agent, which is trained.
       task: the real task.
       agent_steps: steps on the real task for which an agent trains.
-      key: of that training.
+      key: the key of this training.
 
     Raises:
       ConfigError: for anything else. When the policy is called: if it fails, or if the task does
@@ -146,7 +146,7 @@ def copied(
     Args:
       config: form and effort.
       task: the real task.
-      policy: as of `policy_of`.
+      policy: see `policy_of`.
       keys: `search`, for training an agent; `record`, for episodes, errors and fits.
     """
     require_vectors(task)
@@ -199,7 +199,7 @@ def erring(
       states: states that the policy visits. Their mean and deviation whiten the observations that
         an error is linear in. Its unit is the action's bound; for discrete actions, the deviation
         of the policy's outputs in these states.
-      key: of the errors.
+      key: the key of the errors.
       episodes: number of episodes, which are played side by side.
     """
     mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
@@ -255,8 +255,8 @@ def fit(
 ) -> list[Layer]:
     """A copy that is fitted to a policy's actions in some states.
 
-    The loss of continuous actions is the squared error after clipping, of discrete ones the
-    cross-entropy. The `scale` is the mean and the deviation that whiten states.
+    The loss is the squared error after clipping for continuous actions, the cross-entropy for
+    discrete actions. The `scale` is the mean and the deviation that whiten states.
     """
     is_discrete = task.num_actions is not None
     mean, std = scale

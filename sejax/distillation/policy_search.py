@@ -143,12 +143,12 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     """Builds the functions of a search.
 
     Args:
-      config: of the search.
+      config: the search's configuration.
       task: the real task.
       devices: number of devices that episodes are spread over; None for all.
 
     Raises:
-      ConfigError: for a task whose observations are no vectors.
+      ConfigError: for a task whose observations are not vectors.
 
     Example:
       >>> import sejax
@@ -248,7 +248,7 @@ class Lesson(NamedTuple):
 
     Attributes:
       generation: the policy's generation in its search; 0 for a copy.
-      layers: as of `sejax.proxies.exact`.
+      layers: as in `sejax.proxies.exact`.
       states: observations that it visited, `[state, obs_dim]`.
       policy_return: its mean return on the real task.
     """
@@ -270,7 +270,7 @@ def searched(
     """The best tested policy of each of `num_lessons` equal parts of a search.
 
     Args:
-      options: of the search.
+      options: the search's configuration.
       task: the real task.
       num_lessons: number of parts; fewer if fewer policies are tested.
       keys: `search`, `test` and `record`.

@@ -40,7 +40,7 @@ def students(
       ses: environment and weights of each SE; all have one configuration.
       lessons: the lessons that the SEs were made of.
       config: agents and their trainings.
-      keys: of the students, `[student]`, the same on all SEs.
+      keys: the students' keys, `[student]`, the same on all SEs.
       store: where students are kept.
     """
     # The weights name the entry: the policy behind the name in `policy` may have changed.
@@ -68,9 +68,9 @@ def teach(
 
     Args:
       ses: environment and weights of each SE; all have one configuration.
-      agent: of the students.
+      agent: the students' agent.
       config: its `training` is a student's training; students use its `devices`.
-      keys: of the students, `[student]`, the same on all SEs.
+      keys: the students' keys, `[student]`, the same on all SEs.
 
     Returns:
       By name, `[se * student]` each: `test_return`, the mean over test episodes, nan for a student

@@ -40,7 +40,7 @@ class Task(TaskSpec):
         returns observation, state, reward, terminated and info. `info["discount"]` may give the
         factor of a target's bootstrap value; without it the factor is 1 minus terminated.
       params: its `EnvParams`; the environment's `default_params` if not given.
-      solved_reward, info_keys, augmented_keys: as of `TaskSpec`.
+      solved_reward, info_keys, augmented_keys: see `TaskSpec`.
       max_steps: step limit of an episode; put into `params`, or taken from there if not given.
       origin: plain values from which `sejax.envs.make` makes the task again. None for a task made
         by hand: whoever loads a proxy of it must pass the task.
@@ -62,7 +62,7 @@ class Task(TaskSpec):
     params: EnvParams = None  # type: ignore[assignment]
     max_steps: int = None  # type: ignore[assignment]
     origin: Mapping[str, object] | None = None
-    observation: Space = field(init=False)  # of `env`, so that `dataclasses.replace` may change it
+    observation: Space = field(init=False)  # from `env`, which `dataclasses.replace` may change
     action: Space = field(init=False)
 
     def __post_init__(self) -> None:

@@ -111,9 +111,9 @@ class ClassicTask:
     """A task without options.
 
     Attributes:
-      name: of the task.
-      gymnax_id: of its dynamics.
-      spec: what is known of it.
+      name: the task's name.
+      gymnax_id: gymnax's id of the dynamics.
+      spec: the task's spec.
     """
 
     name: ClassVar[str]

@@ -36,7 +36,7 @@ class GridState(EnvState):
 
 @struct.dataclass
 class GridParams(EnvParams):
-    """Reward of a step, by the cell in which it ends; the defaults are the 2x2 room's."""
+    """Reward of a step, by the cell that it ends in; the defaults are for the 2x2 room."""
 
     step_reward: float = -0.01
     goal_reward: float = 1.0
@@ -64,7 +64,7 @@ class GridWorld(Environment[GridState, GridParams]):
         Args:
           rows: strings of equal length: one S where episodes start, G for goals, O for holes, # for
             walls and a space for floor.
-          params: `default_params`; those of `GridParams` if not given.
+          params: `default_params`; the defaults of `GridParams` if not given.
         """
         cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))

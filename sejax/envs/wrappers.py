@@ -190,7 +190,7 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
     """An environment that agents can use: `env` itself, or `env` in `AsVectors`.
 
     Raises:
-      ConfigError: for spaces other than boxes and discrete ones, or actions without bounds.
+      ConfigError: for a space that is no box and not discrete, or actions without bounds.
     """
     observation, action = spaces_of(env, params)
     if isinstance(env, Environment) and env.spaces is not None:

@@ -31,7 +31,7 @@ def make(
       task: the real task, or its id in Gymnasium; needed unless sejax and Gymnasium both know the
         task. Episodes of an SE keep the step limit in its file. An RN needs an id here;
         `RewardNetwork` wraps any environment.
-      render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
+      render_mode: for an RN's real task, as in `gymnasium.make`; an SE has no pictures, and ignores
         it.
 
     Raises:
@@ -63,9 +63,9 @@ def make_vec(
     environments of the real task, stepped one after the other.
 
     Args:
-      source: as of `make`.
+      source: see `make`.
       num_envs: number of environments.
-      task: as of `make`.
+      task: see `make`.
       autoreset_mode: what happens when an episode ends; see `SyntheticVectorEnv`.
 
     Raises:
@@ -91,9 +91,9 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     environments of the real task in a `DummyVecEnv`.
 
     Args:
-      source: as of `make`.
+      source: see `make`.
       num_envs: number of environments.
-      task: as of `make`.
+      task: see `make`.
 
     Raises:
       ConfigError: as `make_vec`, or without Stable-Baselines3.

@@ -39,8 +39,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     Args:
       env: an environment of the RN's task with its step limit, as `gymnasium.make` gives it.
-        Wrappers that change observations or rewards go around this one: the network knows those of
-        the task.
+        Wrappers that change observations or rewards go around this one: the network knows the
+        task's own.
       source: a run directory, a safetensors file of one RN, or the name of one that ships with the
         package.
       discount: gamma of the agent that will train.
@@ -81,7 +81,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
         if isinstance(env.observation_space, Discrete) and self._layers:
             self._table = self._apply(np.eye(num_inputs)).tolist()
-        self._potential = 0.0  # of the state that the agent is in
+        self._potential = 0.0  # of the agent's state
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode of the environment."""
@@ -136,7 +136,7 @@ def _require_task(env: Env, header: Header) -> None:
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    must = f"must be sejax's {shortened(header.task, 40)}; no wrapper may change its observations"
+    must = f"must be sejax's {shortened(header.task, 40)}, its observations unchanged by wrappers"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, which has other rules
         and _signature(env.observation_space) == _signature(learned.observation_space)

@@ -20,7 +20,7 @@ class SyntheticVecEnv(DummyVecEnv):
     `get_attr`, `set_attr` and `env_method` reach other environments, which take no steps.
 
     Args:
-      world: of the SE.
+      world: the SE's world.
       num_envs: number of environments.
     """
 

@@ -33,14 +33,14 @@ class SyntheticWorld:
     a batch of them along a first axis.
 
     Args:
-      weights: by `network/layer/parameter`, kernels `[out, in]` and biases `[out]`, float32.
-      config: of the SE.
+      weights: arrays by `network/layer/parameter`, kernels `[out, in]` and biases `[out]`, float32.
+      config: the SE's configuration.
       task: the part of the real task that the SE uses.
 
     Attributes:
-      observation_space: of one episode: a `Box` without bounds, or the task's own `Discrete`.
+      observation_space: for one episode: a `Box` without bounds, or the task's own `Discrete`.
       action_space: the task's.
-      max_steps: of an episode.
+      max_steps: the step limit of an episode.
       draws_ends: whether ends of episodes are drawn at random.
       draws_noise: whether initial states are made of noise, and not drawn from the real task.
 
@@ -93,8 +93,7 @@ class SyntheticWorld:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
 
         Args:
-          action: of `space`; continuous ones are clipped to its bounds, as in Gymnasium's own
-            environments.
+          action: from `space`; continuous actions are clipped to its bounds, as in Gymnasium.
           space: the task's, or a batch of it.
 
         Raises:
@@ -184,14 +183,14 @@ class SyntheticGymEnv(gymnasium.Env[Any, Any]):
     agents do not see.
 
     Args:
-      world: of the SE.
+      world: the SE's world.
     """
 
     def __init__(self, world: SyntheticWorld):
         self.world = world
         self.observation_space = world.observation_space
         self.action_space = copy.deepcopy(world.action_space)  # with its own sampler
-        self._vector: np.ndarray | None = None  # [obs_dim]: what the networks see and predict
+        self._vector: np.ndarray | None = None  # [obs_dim]: the state that networks see
         self._time = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -229,7 +228,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     are those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
-      world: of the SE.
+      world: the SE's world.
       num_envs: number of environments.
       autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
         or SameStep (the step that ends an episode returns the next one's first observation, and its
@@ -252,7 +251,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._times = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
         self._generators: list[np.random.Generator] = []  # from the first reset on
-        # Drawing many numbers at once is quicker; a generator gives the same ones as one by one.
+        # Drawing many numbers at once is quicker than one by one, and gives the same numbers.
         num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
         self._num_used = np.full(num_envs, num_drawn)  # of the drawn starts

@@ -91,8 +91,8 @@ def real_env(header: Header, **options: Any) -> Env:
     """The task of a file, with its step limit, if Gymnasium or sejax.gym has the same task.
 
     Args:
-      header: of the file.
-      **options: of `gymnasium.make`, such as `render_mode`.
+      header: the file's header.
+      **options: options of `gymnasium.make`, such as `render_mode`.
 
     Raises:
       ConfigError: if neither has it, or for an option that the task does not have here.
@@ -117,8 +117,8 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     """The part that an SE uses of its task, from its file if that is enough.
 
     Args:
-      header: of the file.
-      config: of the SE.
+      header: the file's header.
+      config: the SE's configuration.
       task: the user's task, or its id in Gymnasium; None for the file's.
 
     Raises:

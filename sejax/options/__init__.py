@@ -4,7 +4,7 @@ A configuration is a frozen dataclass that can make an object. Each of its field
 name, type with its bounds, default. Pydantic checks and converts its value. The docstring's texts
 under `Attributes:` are the texts of `--help`.
 
-Every message has one form: the field, what must hold, what came, and how to fix it.
+Every message has one form: the field, the rule, the value, and how to fix it.
 
 Example:
   >>> @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ def require(holds: object, field: str, message: str) -> None:
     Args:
       holds: what must be true.
       field: the field at fault.
-      message: follows the field: what must hold, `; got` what came, and how to fix it.
+      message: the rest of the message: the rule, `; got` the value, and how to fix it.
     """
     if not holds:
         raise ConfigError(f"{field} {message}", field)
@@ -225,8 +225,8 @@ def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> An
     Args:
       candidates: possible readings of the value; the first one that fits counts.
       hint: the type.
-      name: of the field, for messages.
-      default: of the field; None fits where the default is None.
+      name: the field's name, for messages.
+      default: the field's default; if it is None, None fits.
 
     Raises:
       ConfigError: if none fits.
@@ -288,7 +288,7 @@ def field_lines(
 
     Args:
       values: plain values by the fields' names.
-      classes: groups of fields, each with a class whose docstring has their texts.
+      classes: groups of fields, each with the class whose docstring has the texts.
       sources: texts for the ends of the lines, such as the layer that sets a value.
     """
     of_groups = ((group, help_texts(cls).items()) for group, cls in classes)

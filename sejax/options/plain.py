@@ -61,7 +61,7 @@ def from_plain(
 
     Args:
       cls: a dataclass.
-      values: by the names of its fields; those left out have their defaults.
+      values: plain values by field name; missing fields have their defaults.
       where: its name in messages, as `agent` in `agent.batch_size`; may be empty.
       imports: each `module:attribute` that may be imported; None: any.
 

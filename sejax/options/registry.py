@@ -158,7 +158,7 @@ PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymn
 
 
 def names(group: str) -> list[str]:
-    """The registered names: those that come with sejax, then those of installed packages."""
+    """The registered names: first sejax's own, then the names of installed packages."""
     return [*_paths(group)]
 
 
@@ -234,7 +234,7 @@ def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | 
 
     Args:
       group: one of `GROUPS`.
-      values: by the names of the fields.
+      values: plain values by field name.
       imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
@@ -275,7 +275,7 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     Args:
       group: one of `GROUPS`.
       config: the configuration; or the object itself, which is returned.
-      *arguments: of `Makes.make`.
+      *arguments: the arguments of `Makes.make`.
 
     Raises:
       ConfigError: if `config` is neither, or if it makes an object of another class or none.

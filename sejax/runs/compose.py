@@ -33,7 +33,7 @@ from sejax.options.plain import expanded, flatten, merge, split, unquoted
 # The choice of a group if no word, task or proxy makes it.
 DEFAULTS = {group: next(iter(x)) for group, x in registry.BUILT_IN.items() if group != "agent"}
 AGENTS = ("agent", "agents")  # the fields that choose agents
-NAME = re.compile(r"[A-Za-z_][\w.-]*")  # of a field
+NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
 # The text of sejax's own preset files, by their stems.
@@ -171,7 +171,7 @@ def field_of(key: str, keys: Collection[str]) -> str:
 def agents_of(values: Mapping[str, Any]) -> dict[str, str]:
     """The names of the chosen agents by their keys; empty if no word chooses one.
 
-    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents; `agents.KEY.name=ddqn` sets any key.
+    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents, and `agents.KEY.name=ddqn` one by any key.
     """
     chosen: dict[str, str] = {}
     for field in [name for name in ("agents", "agent") if name in values]:
@@ -214,9 +214,9 @@ def _of_preset(
     """The settings of a preset for these choices, nested plain values.
 
     Args:
-      values: by the names of words.
+      values: the words' values by name.
       chosen: the choice of each group.
-      names: of the agents by their keys. A section's `with_agent` may also set fields of other
+      names: the agents' names by key. A section's `with_agent` may also set fields of other
         groups; they count only if there is one agent.
       objective: the objective if neither a word nor the preset chooses one.
 
@@ -248,7 +248,7 @@ def _of_preset(
 
 
 def typed(overrides: Sequence[str]) -> frozenset[str]:
-    """The values of words, and the items of lists: each `module:attribute` may be imported."""
+    """Values of words and items of lists: each `module:attribute` among them may be imported."""
     texts = (override.partition("=")[2].strip("[]") for override in overrides)
     return frozenset(x.strip("[]'\" ") for text in texts for x in split(text))
 
@@ -263,7 +263,7 @@ def compose(
     """Composes a command's words over its preset and its choices.
 
     Args:
-      values: by the names of words; see `read`.
+      values: the words' values by name; see `read`.
       groups: groups of plugins whose choices are fields of the command.
       learns: whether the command learns proxies, so that presets apply.
       stored: settings that a stored proxy was learned with, nested plain values.

@@ -37,7 +37,7 @@ from sejax.proxies import ProxyConfig, header
 from sejax.runs import compose
 from sejax.training import TrainingConfig, require_reachable
 
-TRAINING = TrainingConfig()  # on proxies
+TRAINING = TrainingConfig()  # for proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
 IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
@@ -66,7 +66,7 @@ class CommandConfig(Options):
     """What runs and evaluations share.
 
     Attributes:
-      groups: the groups of plugins whose choices are fields.
+      groups: the groups of plugins whose choices are fields of the command.
       learns: whether the command learns proxies: then presets apply, and several agents have
         shares.
       agents: configurations by key, in the keys' order; see `sejax.runs.compose.agents_of`.
@@ -127,11 +127,11 @@ class CommandConfig(Options):
         the proxy's returns.
 
         Args:
-          key: of the agent.
+          key: the agent's key.
           group: the group of its training's fields.
           training: how long it trains.
           proxy: the proxy's configuration.
-          spec: of the real task.
+          spec: the real task's spec.
 
         Raises:
           ConfigError: if it would learn nothing.
@@ -151,10 +151,10 @@ class CommandConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
-    """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
+    """A whole bilevel optimisation, as `sejax.run` and `sejax.make_learner` take it.
 
     Attributes:
-      weights: of the agents; equal if left out
+      weights: the agents' weights; equal if left out
       preset: settings that were measured (best) or published (paper)
       env: the real task
       proxy: what is learned: a synthetic environment (se) or a reward network (rn)

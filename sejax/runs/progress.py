@@ -14,7 +14,7 @@ class RunProgress:
     """Prints a line for each generation, and at the start a line if the task has no tuned settings.
 
     Args:
-      config: of the run.
+      config: the run's configuration.
       is_quiet: whether nothing is printed.
     """
 
@@ -27,7 +27,7 @@ class RunProgress:
             self.say(f"{none}: these are general ones, not tuned (docs/defaults.md).")
 
     def status(self, text: str) -> None:
-        """Prints what is being done before the first generation."""
+        """Prints a step of the work before the first generation."""
         self._started = time.monotonic()
         self.say(f"{text} ...")
 

@@ -51,7 +51,7 @@ class RunDirectory(Store):
     not imported.
 
     Args:
-      config: of the run.
+      config: the run's configuration.
       field: the field that names the folder, for messages.
 
     Attributes:
@@ -61,7 +61,7 @@ class RunDirectory(Store):
       rows: the rows of `metrics.csv`, one for each saved generation, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
-      versions: of the packages that decide the numbers, from the time of the checkpoint.
+      versions: versions of the packages that decide the numbers, from the time of the checkpoint.
     """
 
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
@@ -101,7 +101,7 @@ class RunDirectory(Store):
         return self.rows[-1][column] if self.rows else "0"
 
     def restore(self, like: State) -> State | None:
-        """Returns the checkpoint's state, and makes its files again; None for a new run.
+        """Returns the checkpoint's state, and makes the other files again; None for a new run.
 
         Args:
           like: a state of the run, or its shapes.
@@ -127,8 +127,7 @@ class RunDirectory(Store):
 
         Args:
           state: pytree of arrays.
-          info: of the block, leaves `[generation, ...]`; generations that are not `active` do not
-            count.
+          info: the block's info, leaves `[generation, ...]`; generations count if they are `active`.
           wall_s: seconds of all sessions.
           cpu_s: CPU seconds of all sessions.
 

@@ -35,7 +35,7 @@ def run(
     chunks: Chunks,
     report: RunProgress | None = None,
 ) -> dict[str, Any]:
-    """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
+    """Runs Algorithm 1, or the rest of it, in chunks of `checkpoint_every` generations.
 
     Args:
       config: the configuration.
@@ -168,7 +168,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
     If the search mean is not finite, the previous file stays.
 
     Args:
-      directory: of the run.
+      directory: the run's directory.
       bilevel: the functions of Algorithm 1.
       state: the state after the last saved generation, on the host.
       first: the first generation without a written proxy.

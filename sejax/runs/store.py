@@ -19,7 +19,7 @@ from sejax.options import ConfigError, shortened
 from sejax.options.plain import differences
 
 Tensors: TypeAlias = Mapping[str, np.ndarray]  # by name
-KIND, FORMAT_VERSION = "sejax_run", 1  # of the files, since the first release
+KIND, FORMAT_VERSION = "sejax_run", 1  # in all files since the first release
 LOCK = "sejax.lock"  # the file that a process locks while it uses the folder
 
 
@@ -120,7 +120,7 @@ class Store:
         """Writes an entry over the previous one of this name.
 
         Args:
-          name: of the entry.
+          name: the entry's name.
           tensors: arrays by name.
           **values: plain values.
 

@@ -38,7 +38,7 @@ from sejax.scoring import GenerationInfo
 Portion: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
 BATCH = 16  # trainings in a share if neither the agent nor the user says how many
 Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
-RETRIES = 20  # how often Ray sends a share again whose worker died
+RETRIES = 20  # how often Ray sends a share again if its worker dies
 LOOK_S = 1.0  # seconds between checks that the cluster still answers
 
 
@@ -141,7 +141,7 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        import ray  # of an extra
+        import ray  # it comes with an extra
 
         _use_one_core()
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -180,8 +180,8 @@ class RemoteChunks(Chunks):
     `Bilevel.generation` to the last bit, if the workers have the same kind of CPU.
 
     Args:
-      config: of the run.
-      compute: gives what `score` returns for each share, in the order of the shares.
+      config: the run's configuration.
+      compute: returns `score` of each share, in the order of the shares.
 
     Attributes:
       cpu_s: CPU seconds that the workers spent on trainings.
@@ -267,7 +267,7 @@ def num_workers(machines: RayConfig) -> int:
     Raises:
       FailedError: if the cluster is gone: Ray itself would wait for ever.
     """
-    import ray  # of an extra
+    import ray  # it comes with an extra
 
     here = ray.get_runtime_context().get_node_id()
     if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
@@ -285,7 +285,7 @@ def _on_cluster(
     Raises:
       FailedError: if a worker raises an error or dies again and again, or the cluster is lost.
     """
-    import ray  # of an extra
+    import ray  # it comes with an extra
 
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
     most, versions, tasks, running = num_workers(machines), runtime.versions(), [], []
@@ -298,7 +298,7 @@ def _on_cluster(
                 num_workers(machines)  # raises if the cluster is gone
     try:
         results: list[Any] = ray.get(tasks)
-    except ray.exceptions.RayError as error:  # its last line is what the worker raised
+    except ray.exceptions.RayError as error:  # its last line is the worker's error
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
         fix = "the same command with machines=local resumes here."
         message = f"A worker has failed: {reason}. What was finished before is saved; {fix}"

@@ -23,7 +23,7 @@ FREE = ("trials", "search_dir", "verify", "fresh_seeds", "study", "space", "devi
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Options):
-    """The fields of `python -m sejax.search`; all others are those of `sejax.run`.
+    """The fields of `python -m sejax.search`; all other fields are those of `sejax.run`.
 
     The defaults are the paper's setting, BOHB with a reduction factor of 3 (appendix, "SE
     hyperparameters").
@@ -32,7 +32,7 @@ class StudyConfig(Options):
       trials: trials that end, pruned or complete
       min_generations: generations before a trial may be pruned; if max_generations, none is pruned
       max_generations: generations of a trial that is not pruned
-      seeds: runs of a trial, whose mean counts
+      seeds: runs of a trial; their mean counts
       space: a preset of ranges, or FILE.yaml
       study: null: <env>-<proxy>-<agent>
       search_dir: null: runs/search-<study>

@@ -38,7 +38,7 @@ class Dimension:
     """A field and the distribution that it is drawn from.
 
     Attributes:
-      name: of the field, such as `es.noise_std`.
+      name: the field's name, such as `es.noise_std`.
       text: the range or choice, as an override has it.
       distribution: Optuna's.
       is_inverse: whether 1 - value is drawn instead of the value.
@@ -129,7 +129,7 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     """The dimensions of a preset, or of a file of your own.
 
     Args:
-      name: of the preset, or a path that ends in .yaml.
+      name: the preset's name, or a path that ends in .yaml.
       agents: the names of the agents by the group of their fields: `agent`, or `agents.KEY` in a
         mixture. In a mixture, `with_agent` gives ranges only to the agents' own fields.
 

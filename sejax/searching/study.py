@@ -31,8 +31,8 @@ from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
 
 WAIT = {"connect_args": {"timeout": 3600}}  # s, for another worker's write to the database
-UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # what a database raises
-SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # of a trial
+UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # errors of a database
+SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # columns of a trial
 
 
 def open_study(search: StudyPlan) -> optuna.Study:
@@ -78,7 +78,7 @@ class Progress(NamedTuple):
 
     Attributes:
       scores: `[generation]`, the trial's score after each generation; nan if it is not finite.
-      train_steps: of all agents.
+      train_steps: training steps of all agents.
       generations: computed generations, the mean over seeds; fewer than scores if runs have solved
         their task.
       is_over: whether all runs have solved their task.
@@ -97,7 +97,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     its last score.
 
     Args:
-      config: of the runs.
+      config: the runs' configuration.
       folder: the run directory; for several runs, `seed0` and so on in it.
       seeds: counted from the configuration's own.
 

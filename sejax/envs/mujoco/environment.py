@@ -28,7 +28,7 @@ class MujocoTask(Options):
     `observe`.
 
     Attributes:
-      name: of the task.
+      name: the task's name.
       file: the model's file, one of Gymnasium's.
       frame_skip: MuJoCo's steps in one step.
       num_hidden: how many positions, from the first on, are not observed.
@@ -119,7 +119,7 @@ class MujocoTask(Options):
 
 @struct.dataclass
 class MujocoState(EnvState):
-    physics: UInt32[Array, " num_words"]  # as of `Physics`
+    physics: UInt32[Array, " num_words"]  # a state of `Physics`
 
 
 class MujocoEnv(Environment[MujocoState, EnvParams]):
