@@ -322,7 +322,7 @@ def searched(
 
 
 def _lesson(options: SearchConfig, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:
-    """A tested policy, with the states that it visits in new episodes: the tests chose it.
+    """A tested policy, with the states that it visits in new episodes, as the tests chose it.
 
     The cost of the new episodes is added to the row.
     """

@@ -8,8 +8,8 @@ from scipy.linalg import block_diag
 
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
 
-# Activations that are computed at once. Arrays of 96 KB stay in the cache. C's allocator asks the
-# system for fresh pages for larger arrays each time, which took ten times as long as the product.
+# Activations that are computed at once. Arrays of 96 KB stay in the cache. For larger
+# arrays C's allocator asks the system for fresh pages each time, which took ten times the product.
 BLOCK = 24 * 1024
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {

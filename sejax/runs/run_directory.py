@@ -127,7 +127,7 @@ class RunDirectory(Store):
 
         Args:
           state: pytree of arrays.
-          info: the block's info, leaves `[generation, ...]`; generations count if they are `active`.
+          info: the block's info, leaves `[generation, ...]`; a generation counts if it is `active`.
           wall_s: seconds of all sessions.
           cpu_s: CPU seconds of all sessions.
 

@@ -1,1 +1,1 @@
-"""Search of hyperparameters: ranges, the study, and its trials. Each trial is a run."""
+"""Search of hyperparameters: ranges, the study, and its trials, which are runs."""

@@ -30,7 +30,7 @@ class StudyConfig(Options):
 
     Attributes:
       trials: trials that end, pruned or complete
-      min_generations: generations before a trial may be pruned; if max_generations, none is pruned
+      min_generations: generations before a trial may be pruned; equal to max_generations: never
       max_generations: generations of a trial that is not pruned
       seeds: runs of a trial; their mean counts
       space: a preset of ranges, or FILE.yaml
