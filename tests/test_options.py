@@ -30,7 +30,7 @@ class Config(Options):
     episodes: options.WholeNumber = 2
     limit: options.Count | None = None
     weight: options.NonNegative = option(0.5, traced=True)
-    rate: Annotated[float, Field(gt=0, le=10)] = option(0.1, varied="triple")
+    rate: Annotated[float, Field(ge=1e-30, le=10)] = option(0.1, varied="triple")
     share: options.Fraction = option(0.9, traced=True, varied="tenth_to_one")
     goal: options.Finite = -1.0
     decay: options.Decay = 1.0
@@ -45,7 +45,7 @@ class Config(Options):
 @pytest.mark.parametrize(("field", "values"), [
     ("size", [0, NAN, True, "x", None, 2**31, 1.5, np.bool_(True), np.ones(2)]),
     ("episodes", [-1, NAN]), ("limit", [0, "x"]), ("weight", [-0.1, NAN, INF, 1e31]),
-    ("share", [1.5, -0.5, NAN]), ("rate", [0, INF, NAN, 11, "x"]),
+    ("share", [1.5, -0.5, NAN]), ("rate", [0, INF, NAN, 11, 5e-324, "x"]),
     ("goal", [INF, NAN, "low", -1e300]), ("decay", [0, 1.5, NAN]), ("kind", ["fency", None, 3]),
 ])  # fmt: skip
 def test_a_value_that_breaks_its_rule_is_refused(field, values):

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float, PyTree
 from pydantic import Field
 
 from sejax.ops.scores import finite_mean
-from sejax.options import Count, Options
+from sejax.options import LEAST, Count, Options
 
 # A number of candidates, each with the weights of a proxy.
 PopulationSize = Annotated[int, Field(ge=2, le=100_000)]
 # Larger steps or noise lead to weights whose products are not finite.
-Scale = Annotated[float, Field(gt=0, le=1e6)]
+Scale = Annotated[float, Field(ge=LEAST, le=1e6)]
 
 T = TypeVar("T")
 StrategyState: TypeAlias = PyTree  # only the strategy reads it

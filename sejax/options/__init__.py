@@ -41,7 +41,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeGuard
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
-MOST = 1e30  # the largest number for programs that compute in 32 bits
+MOST, LEAST = 1e30, 1e-30  # of numbers in programs, which compute in 32 bits
 
 
 # --- errors --------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ WholeNumber = Annotated[int, Field(ge=0, le=LARGEST)]
 # A number of layers, which are traced one by one.
 Depth = Annotated[int, Field(ge=1, le=100)]
 # A number above 0.
-Positive = Annotated[float, Field(gt=0, le=MOST)]
+Positive = Annotated[float, Field(ge=LEAST, le=MOST)]
 # A finite number from 0.
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 # A finite number, of either sign.
@@ -161,7 +161,7 @@ Finite = Annotated[float, Field(ge=-MOST, le=MOST)]
 # A number in [0, 1].
 Fraction = Annotated[float, Field(ge=0, le=1)]
 # A factor in (0, 1] by which something shrinks each generation.
-Decay = Annotated[float, Field(gt=0, le=1)]
+Decay = Annotated[float, Field(ge=LEAST, le=1)]
 # A name of `sejax.ops.networks`.
 Activation = Literal["tanh", "fast_tanh", "relu", "leaky_relu", "prelu"]
 
@@ -242,8 +242,9 @@ def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> An
             if typing.get_origin(hint) is Literal:
                 raise unknown_name(name, str(got), typing.get_args(hint)) from None
             must = problem["msg"].removeprefix("Input should ").partition(", unable")[0]
-            must = must.replace("greater than or equal to", "at least")
-            must = must.replace("less than or equal to", "at most")
+            for bound, words in (("ge", "at least"), ("le", "at most")):
+                if bound in problem.get("ctx", {}):
+                    must = f"be {words} {problem['ctx'][bound]}"
         else:
             if isinstance(got, bool) == isinstance(value, bool):  # bools are numbers in Python
                 return value
