@@ -67,8 +67,8 @@ class CheckConfig(EvaluateConfig):
       machines: where agents train
       algorithms: Other agents than those it was learned with, with default hyperparameters; null:
         all that fit the task.
-      null_steps: most real steps of a random search for a policy, and of a PPO that follows if the
-        search does not solve the task
+      null_steps: real steps, at least one generation, of a random search for a policy, and of a PPO
+        that follows if the search does not solve the task
     """
 
     groups: ClassVar[tuple[str, ...]] = ("exploration", "machines")

@@ -242,8 +242,7 @@ def budget_for(
 
     An agent may begin to learn later than all agents that the proxy was learned with. Ten long
     initial episodes, or a rollout of PPO, could use up a step budget. So the budget grows by the
-    additional wait. The number of episodes grows as much, because an episode may have one step. No
-    more steps are asked for than there were episodes for.
+    additional wait. The number of episodes grows as much, because an episode may have one step.
 
     Args:
       training: training with which the proxy was learned.

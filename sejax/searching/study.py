@@ -98,7 +98,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
 
     Args:
       config: the runs' configuration.
-      folder: the run directory; for several runs, `seed0` and so on in it.
+      folder: the run directory; for several runs, with a folder for each seed.
       seeds: counted from the configuration's own.
 
     Returns:

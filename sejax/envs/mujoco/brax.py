@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sejax.envs.mujoco.tasks import HalfCheetah
 
 # Iterations of mjx's line search; MuJoCo has 50. Under vmap all wait for the longest search. Gaits
-# earn as much with 10 iterations as with 50, but less with 8 (docs/mujoco.md).
+# earn as much with 10 iterations as with 50, but less with 8.
 LS_ITERATIONS = 10
 
 
