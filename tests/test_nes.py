@@ -178,7 +178,7 @@ def evosax_strategy(name):
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name):
-    dims, std, decay = 200, 0.05, 0.5
+    dims, std, decay = 200, 0.05, 0.5 if name == "open_es" else 1.0
     config = EvosaxConfig(name=name, population_size=32, noise_std=std, noise_std_decay=decay)
     strategy = config.make(dims)
     state = strategy.init(jax.random.key(0), jnp.zeros(dims))
@@ -186,6 +186,11 @@ def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(na
     opposite = bool(jnp.abs(members[:16] + members[16:]).max() < 1e-6)
     assert strategy.antithetic == opposite
     assert float(jnp.std(members)) == pytest.approx(std, rel=0.15)
+
+
+def test_what_an_algorithm_does_not_use_is_refused():
+    assert refused(EvosaxConfig, name="cma_es", step_size=0.1) == "es.step_size"
+    assert refused(EvosaxConfig, name="pgpe", noise_std_decay=0.9) == "es.noise_std_decay"
 
 
 def test_step_size_and_decay_of_the_noise_reach_an_algorithm():
