@@ -49,6 +49,7 @@ class World(NamedTuple):
     params: Any
     task: envs.Task
     trainings: dict[str, TrainingConfig]
+    is_varied: bool = False  # whether hyperparameters are random for each agent
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -90,10 +91,10 @@ def evaluate(config: EvaluateConfig) -> float:
     pairs = itertools.product(worlds, config.agents)
     table = pd.concat([_train_and_test(config, x, worlds[x], key) for x, key in pairs])
     summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
-    (key, *others), (name, (*_, task, _)) = config.agents, next(iter(worlds.items()))
+    (key, *others), (name, world) = config.agents, next(iter(worlds.items()))
     who = "agents of each algorithm" if others else f"{key} agents"
-    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
-    title = f"{config.num_agents} fresh {who}, tested on {task.name}{solved}"
+    solved = f" (solved at {world.task.solved_reward:g})" if world.task.is_solvable else ""
+    title = f"{config.num_agents} fresh {who}, tested on {world.task.name}{solved}"
     print_table(summary, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     text = str(summary.to_json(orient="index", indent=2))
@@ -132,16 +133,19 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
         if proxy is not None:
             config.require_learning(key, group, training, proxy.env.config, task)
         trainings[key] = training
+    is_varied = config.agent_hparams == "varied"
+    if proxy is not None and config.agent_hparams == "as_learned":
+        is_varied = proxy.config.get("agent_hparams") == "varied"
     worlds, folder = {}, Path("runs", f"evaluate-{as_file_name(task.name)}")
     if proxy is not None:
-        worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings)
+        worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
         folder = proxy.path.parent
         if folder == header.PRETRAINED_DIR or hub.is_address(config.proxy):
             name = as_file_name(config.proxy.removeprefix(hub.SCHEME))
             folder = Path("runs", f"evaluate-{name}")
     if proxy is None or config.baseline:
         trainings = dict.fromkeys(trainings, real_training)
-        worlds["the real task"] = World(task.env, task.params, task, trainings)
+        worlds["the real task"] = World(task.env, task.params, task, trainings, is_varied)
     return worlds, Path(config.out_dir or folder)
 
 
@@ -191,8 +195,7 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
 
 def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
     """The results of fresh agents in a world: arrays `[agent]` by column of the table."""
-    env, env_params, task, trainings = world
-    is_varied = config.agent_hparams == "varied"
+    env, env_params, task, trainings, is_varied = world
     agent = agents.make_agent(config.agents[key], task, config.exploration, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     how = trainings[key], keys, config.num_parallel, config.devices

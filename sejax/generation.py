@@ -112,7 +112,9 @@ class GenerationEvaluator:
         for agent_index, (numbers, size) in enumerate(pairs):
             population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
             incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
-            active, test_params = jax.tree.map(lambda x, size=size: jnp.repeat(x, size), shared)
+            active, test_params = jax.tree.map(
+                lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
+            )
             trainings = Trainings(
                 key=jnp.concatenate(
                     [keys.population[numbers].ravel(), keys.incumbent[:, agent_index]]

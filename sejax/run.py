@@ -68,7 +68,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
     Raises:
       ConfigError: if a run directory cannot be used.
-      FailedError: after the last run, if all agents of some run diverged.
+      FailedError: after the last run, if no search mean of some run had a finite score.
       OSError: if a file cannot be written; everything saved before is whole.
     """
     scores, diverged = [], []
@@ -99,7 +99,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
         for config, score in zip(configs, scores, strict=True):
             print(f"{score:10.1f}  {config.resolved_run_dir}")
     if diverged:
-        what = f"All agents of {', '.join(map(str, diverged))} diverged: nothing was learned."
+        runs = ", ".join(map(str, diverged))
+        what = f"All agents of {runs} diverged, or all on its search means: nothing was learned."
         fix = "Does the task return NaN? If it does not, set a smaller agent.learning_rate."
         anew = "Delete the folder, or set another run_dir, to begin anew."
         raise FailedError(f"{what} {fix} {anew}")

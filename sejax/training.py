@@ -26,7 +26,7 @@ from sejax.ops.modes import require_modes
 from sejax.ops.parallel import in_batches_on_cpu
 from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require, shortened
 from sejax.options.registry import require_part
-from sejax.proxies.base import ProxyEnv, is_real
+from sejax.proxies.base import is_real, proxy_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,10 +252,10 @@ class _Loop:
         self.env = repeat_actions(env, agent.spec.action_repeat)
         self.max_steps = self.buffer_steps = training.max_steps or LARGEST
         self.prepare = lambda params, hparams: params
-        if isinstance(env, ProxyEnv):
-            require_reachable("training", training, env.max_steps)
-            self.buffer_steps = min(self.max_steps, training.max_episodes * env.max_steps)
-            self.prepare = lambda params, hparams: env.prepare(
+        if (proxy := proxy_in(env)) is not None:
+            require_reachable("training", training, proxy.max_steps)
+            self.buffer_steps = min(self.max_steps, training.max_episodes * proxy.max_steps)
+            self.prepare = lambda params, hparams: proxy.prepare(
                 params, agent.discount(hparams), limit_is_terminal
             )
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))

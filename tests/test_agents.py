@@ -246,26 +246,20 @@ class Fixed(AgentConfig):
         return parts(PLAIN[0])[1]
 
 
-@pytest.mark.parametrize(
-    ("make", "field"),
-    [
-        (lambda: sejax.DDQNConfig(learning_rate=1e300), "agent.learning_rate"),
-        (lambda: sejax.DDQNConfig(learning_rate=5e-324), "agent.learning_rate"),
-        (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.batch_size"),
-        (
-            lambda: make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE),
-            "agent.target_entropy",
-        ),
-        (lambda: make_agent(Unrelated(), CARTPOLE), "agent"),
-        (lambda: make_agent("ppo", CARTPOLE), "agent"),
-        (lambda: make_agent(sejax.DDQNConfig, CARTPOLE), "agent"),
-        (lambda: make_agent(sejax.QLearningConfig(), CARTPOLE), "agent"),
-        (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, Unrelated()), "exploration"),
-        (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, COUNTS), "exploration"),
-        (lambda: make_agent(Fixed(), ROOM, varied=True), "agent_hparams"),
-        (lambda: make_trainer(make_agent(sejax.QLearningConfig(), ROOM), CLIFF.env), "agent"),
-        (lambda: make_trainer(make_agent(sejax.DDQNConfig(), ACROBOT), CARTPOLE.env), "agent"),
-    ],
-)
+@pytest.mark.parametrize(("make", "field"), [
+    (lambda: sejax.DDQNConfig(learning_rate=1e300), "agent.learning_rate"),
+    (lambda: sejax.DDQNConfig(learning_rate=5e-324), "agent.learning_rate"),
+    (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.batch_size"),
+    (lambda: make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE), "agent.target_entropy"),
+    (lambda: make_agent(Unrelated(), CARTPOLE), "agent"),
+    (lambda: make_agent("ppo", CARTPOLE), "agent"),
+    (lambda: make_agent(sejax.DDQNConfig, CARTPOLE), "agent"),
+    (lambda: make_agent(sejax.QLearningConfig(), CARTPOLE), "agent"),
+    (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, Unrelated()), "exploration"),
+    (lambda: make_agent(sejax.DDQNConfig(), CARTPOLE, COUNTS), "exploration"),
+    (lambda: make_agent(Fixed(), ROOM, varied=True), "agent_hparams"),
+    (lambda: make_trainer(make_agent(sejax.QLearningConfig(), ROOM), CLIFF.env), "agent"),
+    (lambda: make_trainer(make_agent(sejax.DDQNConfig(), ACROBOT), CARTPOLE.env), "agent"),
+])  # fmt: skip
 def test_an_agent_that_cannot_work_is_refused(make, field):
     assert refused(make) == field

@@ -123,6 +123,9 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     candidates = program.ask(state)
     assert candidates.test_params.scored_steps == 1 < program.proxy.task.max_steps
     (trainings,), (run,) = program.evaluate.trainings(candidates), program.evaluate.runs
+    of_vectors = dataclasses.replace(candidates, test_params=jnp.arange(2))  # a leaf may have axes
+    (repeated,) = program.evaluate.trainings(of_vectors)
+    np.testing.assert_array_equal(repeated.test_params, [[0, 1]] * len(trainings.candidate))
     outcome = jax.jit(lambda: jax.lax.map(run, trainings))()
     assert (outcome.scored_returns != outcome.test_returns).any()
     after, info = jax.jit(program.generation)(state)

@@ -103,6 +103,17 @@ def test_evaluate_trains_the_agents_that_a_proxy_was_learned_with(name):
         assert evaluate_config([*words, "agent_hparams=default"]).agent == type(agent)()
 
 
+def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
+    env, params = sejax.load("cliff_walking-rn")
+    for hparams in ("default", "varied"):
+        config = env.learned_config | {"agent_hparams": hparams}
+        sejax.save(tmp_path / "x.safetensors", env, params.weights, config, 0.8)
+        proxy = sejax.load_proxy(tmp_path / "x.safetensors")
+        assert (sejax.agent_of(proxy).varied is not None) == (hparams == "varied")
+        worlds, _ = evaluate.setup_of(evaluate_config([f"proxy={proxy.path}"]))
+        assert {world.is_varied for world in worlds.values()} == {hparams == "varied"}
+
+
 def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():
     learned = sejax.load_proxy("cartpole").learned_agents()
     config = evaluate_config(["proxy=cartpole", "agents=[ppo,sac]", "agents.ppo.epochs=3"])

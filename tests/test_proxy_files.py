@@ -72,7 +72,9 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
     assert refused(proxy.learned_with, "agent") == "agent"
     assert refused(sejax.training_of, proxy) == "training"
-    sejax.save(path, env, weights[1], {"training": {"max_steps": 7}}, 0.7)  # without the field
+    other = {"name": "rn", "variant": "additive_non_potential"}  # the environment's own counts
+    sejax.save(path, env, weights[1], {"training": {"max_steps": 7}, "proxy": other}, 0.7)
+    assert sejax.load_proxy(path).env.config == env.config
     assert sejax.training_of(sejax.load_proxy(path)).time_limit_is_terminal
 
 
@@ -90,6 +92,9 @@ def test_a_set_comes_back_and_parts_of_it_are_chosen_by_score_and_place(tmp_path
     assert refused(sejax.load_set, path, option="--ses", kind="se") == "--ses"
     assert proxies.ranked(2).seeds.tolist() == [6, 7]
     assert proxies.ranked(2, worst=True).seeds.tolist() == [5, 7]
+    sejax.save_set(tmp_path / "x", env, weights, [{"seed": 5}, *records[1:]], CONFIG, 0.7)
+    for worst, seeds in ((False, [6, 7, 5]), (True, [7, 6, 5])):  # without a score comes last
+        assert sejax.load_set(tmp_path / "x").ranked(3, worst).seeds.tolist() == seeds
     assert proxies[proxies.scores >= 0.8].seeds.tolist() == [6, 7]
     assert proxies[:2].seeds.tolist() == [5, 6]
     chosen = proxies[[2, 0]]

@@ -359,7 +359,10 @@ def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, m
         assert "sejax.evaluate" not in out and "sejax.load" not in out
         assert [row["num_nonfinite"] for row in rows(tmp_path / "run")] == ["6"]
         assert not [*(tmp_path / "run").glob("proxy*")]
-        assert json.loads((tmp_path / "run" / "run.json").read_text())["ended"] == "diverged"
+        summary = json.loads((tmp_path / "run" / "run.json").read_text())
+        assert summary["ended"] == "diverged"
+        (tmp_path / "run" / "run.json").write_text(json.dumps(summary | {"machine": "mine"}))
+    assert summary["machine"] == "mine"  # of the one that computed it
     sweep = [*TINY, "env=my_broken:make", "env.reward=nan,1.0", "generations=1", "run_dir=sweep"]
     status, _, err = ended(monkeypatch, capsys, START, *sweep)
     assert status == commands.FAILED and "All agents of sweep/env.reward_nan diverged" in err

@@ -10,6 +10,7 @@ from support import assert_close, bits, numpy_forward, paper_se, refused
 
 import sejax
 from sejax import envs
+from sejax.envs.wrappers import Wrapper
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import is_real
@@ -321,6 +322,7 @@ def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
     assert env.num_actions == 3 and env.observation_space().shape == (6,)
     assert env.name == "Synthetic-acrobot" and not is_real(env) and env.max_steps == 500
+    assert not is_real(Wrapper(env)) and is_real(Wrapper(env.task.env))
     assert make_env("acrobot") is env  # one instance for each configuration
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from sejax import options
 from sejax.envs.base import Task
-from sejax.options import Count, Options, require, shortened
+from sejax.options import Count, Options
 
 PREFIX = "gymnax/"
 # Gymnasium's registry defines when these count as solved; it has no threshold for the others.
@@ -41,10 +41,6 @@ class GymnaxTask(Options):
     max_steps: Count | None = None
 
     def make(self) -> Task:
-        got = f"got {shortened(self.name)}. Other suites are in an example now"
-        fix = "Set env=other_suites:task in the folder examples/"
-        is_gymnax = self.name.startswith(PREFIX)
-        require(is_gymnax, "env", f"must be one of gymnax; {got}. {fix}.")
         import gymnax
         from gymnax.registration import registered_envs
 
@@ -57,8 +53,7 @@ class GymnaxTask(Options):
             raised = f"{gymnax_id} raised {options.told(error)}"
             message = f"env must be an environment that gymnax can make here; {raised}."
             raise options.ConfigError(message, "env") from error
-        solved = self.solved_reward
-        if solved is None:
-            solved = SOLVED_REWARD.get(gymnax_id, math.inf)
+        usual = SOLVED_REWARD.get(gymnax_id, math.inf)
+        solved = usual if self.solved_reward is None else self.solved_reward
         max_steps = self.max_steps or params.max_steps_in_episode
         return Task(name=self.name, env=env, solved_reward=solved, max_steps=max_steps)

@@ -36,8 +36,6 @@ ALGORITHMS = {
     "snes": ("SNES", False, "sgd"),
     "xnes": ("xNES", False, "sgd"),
 }
-# The algorithms that use a field.
-USERS = {"noise_std_decay": ("open_es",), "step_size": ("open_es", "pgpe")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +64,8 @@ class EvosaxConfig(StrategyOptions):
         require_known("es.name", self.name, ALGORITHMS)
         size, field = self.population_size, "es.population_size"
         require(size % 2 == 0, field, f"must be even; got {size}. Set {field}={size + 1}.")
-        for name, algorithms in USERS.items():
-            value, is_used = getattr(self, name), self.name in algorithms
+        for name, algorithms in (("noise_std_decay", "open_es"), ("step_size", "open_es pgpe")):
+            value, is_used = getattr(self, name), self.name in algorithms.split()
             message = f"must be left out with es={self.name}, which has none; got {value}."
             require(is_used or value == getattr(type(self), name), f"es.{name}", message)
 

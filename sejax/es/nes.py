@@ -13,9 +13,9 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from sejax.es.base import PopulationSize, Scale, Strategy, StrategyOptions
-from sejax.es.score_transforms import OwnTransform, require_transform, transform_of
+from sejax.es.score_transforms import FIELD, TRANSFORMS, OwnTransform, transform_of
 from sejax.ops.scores import or_minus_inf
-from sejax.options import Count, Decay, Fraction, option
+from sejax.options import Count, Decay, Fraction, option, registry, require_known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,11 @@ class NESConfig(StrategyOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_transform(self.score_transform)
+        choice = self.score_transform
+        if isinstance(choice, str) and ":" in choice:
+            registry.require_path(FIELD, choice)
+        elif not callable(choice):
+            require_known(FIELD, choice, TRANSFORMS)
 
     def make(self, num_dims: int) -> Strategy:
         r"""NES over vectors `[num_dims]`.

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sejax.ops.scores import is_tie, or_lowest_finite, or_minus_inf
-from sejax.options import ConfigError, registry, require, require_known, told
+from sejax.options import ConfigError, registry, require, told
 
 FIELD = "es.score_transform"
 Scores = Float[Array, " pop"]
@@ -95,18 +95,6 @@ def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 _BY_RANK = (linear, rank, nes, nes_unnormalized)
 _BY_ADVANTAGE = (single_best, single_better, all_better_1, all_better_2)
 TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY_ADVANTAGE)}
-
-
-def require_transform(choice: str | OwnTransform) -> None:
-    """Checks that a choice is a name, a `module:attribute` that may be imported, or a function.
-
-    Raises:
-      ConfigError: for anything else. Nothing is imported.
-    """
-    if isinstance(choice, str) and ":" in choice:
-        registry.require_path(FIELD, choice)
-    elif not callable(choice):
-        require_known(FIELD, choice, TRANSFORMS)
 
 
 def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:

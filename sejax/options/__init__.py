@@ -320,11 +320,9 @@ def is_number(value: object) -> TypeGuard[float]:
 
 def as_python(value: Any) -> Any:
     """A number or bool of NumPy or jax as Python's; others, traced ones too, stay as they are."""
-    if getattr(value, "shape", None) != () or not hasattr(value, "item"):
-        return value
     try:
-        return value.item()
-    except (TypeError, NotImplementedError):  # a traced array has no value yet, a key none at all
+        return value.item() if getattr(value, "shape", None) == () else value
+    except (AttributeError, TypeError, NotImplementedError):  # a traced array, a shape, or a key
         return value
 
 

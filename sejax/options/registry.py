@@ -151,7 +151,7 @@ BUILT_IN = {
     "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
 }
 # Beginnings of names of tasks: a dataclass with a field `name` serves all names that begin so.
-PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.gymnax:GymnaxTask"}
+PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask"}
 
 
 # --- names ---------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from jaxtyping import Array, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
+from sejax.envs.wrappers import Wrapper
 from sejax.options import ConfigError, Options, as_text, shortened
 
 # An episode ends if a network's reward or entry of a state is beyond this. The real task's own
@@ -165,6 +166,13 @@ class ProxyEnv(Environment, ABC):
         return f"{type(self).__name__.removesuffix('Env')}-{self.task.name}"
 
 
+def proxy_in(env: Environment) -> ProxyEnv | None:
+    """The proxy that an environment is, or wraps; None for a real task."""
+    while isinstance(env, Wrapper) and not isinstance(env, ProxyEnv):
+        env = env.env
+    return env if isinstance(env, ProxyEnv) else None
+
+
 def is_real(env: Environment) -> bool:
     """Whether steps in an environment are steps of a real task."""
-    return not isinstance(env, ProxyEnv) or env.is_real
+    return (proxy := proxy_in(env)) is None or proxy.is_real

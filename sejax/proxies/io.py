@@ -161,8 +161,9 @@ class ProxySet(_Loaded):
         return np.array([record.get("seed", -1) for record in self.records])
 
     def ranked(self, count: int, worst: bool = False) -> "ProxySet":
-        """`count` proxies: the best, best first; or with `worst` the worst, worst first."""
-        order = np.argsort(self.scores, kind="stable")
+        """The `count` best proxies, best first, or the worst; proxies without a score come last."""
+        scores = np.nan_to_num(self.scores, nan=np.inf if worst else -np.inf)
+        order = np.argsort(scores, kind="stable")
         return self[(order if worst else order[::-1])[:count]]
 
 
@@ -197,7 +198,8 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
     require_known("name", name, stored)
     agent = header.configured("agent", stored[name], env.name)
     explored = config.get("exploration", {"name": "none"})
-    return make_agent(agent, env.task, header.configured("exploration", explored, env.name))
+    exploration = header.configured("exploration", explored, env.name)
+    return make_agent(agent, env.task, exploration, config.get("agent_hparams") == "varied")
 
 
 def training_of(
@@ -333,7 +335,7 @@ def save_set(
             task=env.task.name,
             interface=env.task.interface,
             # Without the folder, which is a path on the machine of the run.
-            config={**known, **(config or {}), "run_dir": None},
+            config={**known, **(config or {}), **known, "run_dir": None},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],

@@ -2,7 +2,7 @@
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
 texts. `read` lays them on the file that `preset=FILE.yaml` names. `compose` finds the choice of
-every group: a word's, else the default of the task and the proxy. It merges three layers: the
+every group: a word's, else the default of the task and the proxy. It merges four layers: the
 choices; over them the preset, or the settings that a stored proxy was learned with; over both the
 words. `runs.config` checks the names later, when it makes dataclasses of the layers.
 

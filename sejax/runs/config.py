@@ -72,8 +72,8 @@ class CommandConfig(Options):
       agents: configurations by key, in the keys' order; see `sejax.runs.compose.agents_of`.
       exploration: intrinsic reward of the agents
       training: training on proxies
-      num_parallel: Agents that train side by side on one device; on a CPU at most the fastest
-        number. null: what suits the agent and the device.
+      num_parallel: Agents that train side by side on one device; null: what suits the agent and
+        the device.
       devices: null: all
     """
 

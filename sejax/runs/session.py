@@ -44,8 +44,8 @@ def run(
       report: prints each generation; None: nothing is printed.
 
     Returns:
-      The content of `run.json`. `ended` is finished, solved, or diverged. If all agents of a run
-      have diverged, it stops and writes no proxy.
+      The content of `run.json`. `ended` is finished, solved, or diverged: no search mean had a
+      finite score, and there is no proxy. If all agents diverge, the run stops.
 
     Raises:
       ConfigError: if another version wrote the folder's state.
@@ -79,12 +79,17 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    ended = "diverged" if _all_diverged(directory, bilevel) else "finished"
+    ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
     generations, agents = len(directory.rows), bilevel.strategy.num_evaluations
+    summary_file = directory.path / "run.json"
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # none, or damaged
+        stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
+        if (stored["generations"], stored["ended"]) == (generations, ended):
+            return stored  # which names the machine that computed it
     steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
-        "ended": "solved" if state.solved else ended,
+        "ended": ended,
         "best_score": float(state.best_score),
         "solved_score": bilevel.solved_score,
         "wall_s": round(start_wall_s + time.monotonic(), 1),
@@ -97,7 +102,7 @@ def run(
         "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
         "versions": {"python": platform.python_version()} | versions,
     }
-    write_text(directory.path / "run.json", json.dumps(summary, indent=2) + "\n")
+    write_text(summary_file, json.dumps(summary, indent=2) + "\n")
     return summary
 
 
@@ -163,7 +168,7 @@ def interrupts_held() -> Iterator[None]:
 
 
 def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, first: int) -> None:
-    """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
+    """Writes the best proxy, if it is new, and the last one; none before a finite score.
 
     If the search mean is not finite, the previous file stays.
 
@@ -176,7 +181,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
     Raises:
       OSError: if a file cannot be written.
     """
-    if _all_diverged(directory, bilevel):
+    if state.best_generation < 0:
         return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
