@@ -123,15 +123,12 @@ def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
     assert shown.learning.real_steps > 200 + 2 * shown.policy_return + rows["real_steps"].sum()
 
 
-@pytest.mark.parametrize(
-    "word",
-    [
-        *("num_snapshots=0", "search.num_top=5", "search.generationz=5", "agent=nothing"),
-        *("generations=5", "proxy.hidden_size=5"),
-        *("policy=sax", "policy=nothing:act", "policy=td3"),
-        *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),
-    ],
-)
+@pytest.mark.parametrize("word", [
+    *("num_snapshots=0", "search.num_top=5", "search.generationz=5", "agent=nothing"),
+    *("generations=5", "proxy.hidden_size=5"),
+    *("policy=sax", "policy=nothing:act", "policy=td3"),
+    *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),
+])  # fmt: skip
 def test_what_cannot_be_is_refused_and_leaves_nothing(word, tmp_path):
     field = refused(main, [*QUICK, f"run_dir={tmp_path}/runs/a", word])
     assert field == word.partition("=")[0]

@@ -244,14 +244,11 @@ def walk(rows, index, action):
     return target[0] * len(rows[0]) + target[1], cells[target]
 
 
-@pytest.mark.parametrize(
-    ("name", "rows", "rewards"),
-    [
-        ("cliff_walking", CLIFF_WALKING, {" ": -1, "S": -1, "O": -100, "G": 0}),
-        ("gridworld_2x2", ROOM_2X2, {" ": -0.01, "S": -0.01, "G": 1}),
-        ("maze", MAZE, {" ": -0.01, "S": -0.01, "O": -1, "G": 1, "#": -0.01}),
-    ],
-)
+@pytest.mark.parametrize(("name", "rows", "rewards"), [
+    ("cliff_walking", CLIFF_WALKING, {" ": -1, "S": -1, "O": -100, "G": 0}),
+    ("gridworld_2x2", ROOM_2X2, {" ": -0.01, "S": -0.01, "G": 1}),
+    ("maze", MAZE, {" ": -0.01, "S": -0.01, "O": -1, "G": 1, "#": -0.01}),
+])  # fmt: skip
 def test_every_step_in_a_grid_follows_its_map(name, rows, rewards):
     env, params = GridWorld(rows), GridParams()
     if name != "maze":

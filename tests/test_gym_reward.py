@@ -135,16 +135,13 @@ def test_weighted_info_is_a_product(stored_rn, variant):
     assert reward == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("kind", "real", "learned", "expected"),
-    [
-        ("additive", np.nan, 1.0, None),
-        ("additive", np.inf, 1.0, None),
-        ("additive", 0.5, 1e9, None),
-        ("additive", -2e7, 1.0, -2e7),
-        ("exclusive", -2e7, 1.0, 1.0),
-    ],
-)
+@pytest.mark.parametrize(("kind", "real", "learned", "expected"), [
+    ("additive", np.nan, 1.0, None),
+    ("additive", np.inf, 1.0, None),
+    ("additive", 0.5, 1e9, None),
+    ("additive", -2e7, 1.0, -2e7),
+    ("exclusive", -2e7, 1.0, 1.0),
+])  # fmt: skip
 def test_an_absurd_reward_is_none_and_terminates(stored_rn, kind, real, learned, expected):
     """A real one of money's size passes, and a learned one does not."""
     env = RewardNetwork(Walk(real), stored_rn(2, variant=f"{kind}_non_potential")[0])

@@ -179,17 +179,14 @@ def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
         np.testing.assert_allclose(obs, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("is_wrapped", "spaces_of_env"),
-    [
-        (False, (spaces.Discrete(2),)),
-        (False, (spaces.Box(-2.0, 2.0, (1,)),)),
-        (True, (spaces.Box(-2.0, 2.0, ()),)),
-        (True, (spaces.Box(-2.0, 1.0, (1,)),)),
-        (True, (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)),)),
-        (True, (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)))),
-    ],
-)
+@pytest.mark.parametrize(("is_wrapped", "spaces_of_env"), [
+    (False, (spaces.Discrete(2),)),
+    (False, (spaces.Box(-2.0, 2.0, (1,)),)),
+    (True, (spaces.Box(-2.0, 2.0, ()),)),
+    (True, (spaces.Box(-2.0, 1.0, (1,)),)),
+    (True, (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)),)),
+    (True, (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)))),
+])  # fmt: skip
 def test_environments_that_agents_can_take_as_they_are_are_left_alone(is_wrapped, spaces_of_env):
     assert isinstance(odd_task(*spaces_of_env).env, AsVectors) == is_wrapped
 
@@ -197,17 +194,14 @@ def test_environments_that_agents_can_take_as_they_are_are_left_alone(is_wrapped
 DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])
 
 
-@pytest.mark.parametrize(
-    "spaces_of_env",
-    [
-        (DICT,),
-        (TUPLE,),
-        (spaces.Discrete(2), DICT),
-        (spaces.Box(-jnp.inf, 1.0, (1,)),),
-        (spaces.Box(-1.0, jnp.inf, (1,)),),
-        (spaces.Box(1.0, 1.0, (1,)),),
-    ],
-)
+@pytest.mark.parametrize("spaces_of_env", [
+    (DICT,),
+    (TUPLE,),
+    (spaces.Discrete(2), DICT),
+    (spaces.Box(-jnp.inf, 1.0, (1,)),),
+    (spaces.Box(-1.0, jnp.inf, (1,)),),
+    (spaces.Box(1.0, 1.0, (1,)),),
+])  # fmt: skip
 def test_spaces_that_no_agent_could_use_are_refused(spaces_of_env):
     assert refused(odd_task, *spaces_of_env) == "env"
 
@@ -223,25 +217,22 @@ class Limit(NamedTuple):
     max_steps_in_episode: int = 3
 
 
-@pytest.mark.parametrize(
-    ("env", "options", "field"),
-    [
-        (changed(is_truncated=None), {}, "env"),
-        (changed(action_space=lambda self, params: {}["actions"]), {}, "env"),
-        (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
-        (changed(obs=np.zeros(3)), {}, "env"),
-        (changed(step_env=drifts), {}, "env"),
-        (changed(terminated=np.float32(0)), {}, "env"),
-        (changed(reward=np.zeros(2)), {}, "env"),
-        (gymnax.make("CartPole-v1"), {}, "env"),  # a pair
-        (Plain(), {"params": Limit(), "max_steps": 5}, "env"),
-        (Plain(), {"params": gymnax.EnvState(time=0)}, "env"),
-        (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "env"),  # whose step is never called
-        (Plain(), {"solved_reward": "high"}, "env.solved_reward"),
-        (Plain(), {"solved_reward": math.nan}, "env.solved_reward"),
-        (Plain(), {"max_steps": 0}, "env.max_steps"),
-    ],
-)
+@pytest.mark.parametrize(("env", "options", "field"), [
+    (changed(is_truncated=None), {}, "env"),
+    (changed(action_space=lambda self, params: {}["actions"]), {}, "env"),
+    (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
+    (changed(obs=np.zeros(3)), {}, "env"),
+    (changed(step_env=drifts), {}, "env"),
+    (changed(terminated=np.float32(0)), {}, "env"),
+    (changed(reward=np.zeros(2)), {}, "env"),
+    (gymnax.make("CartPole-v1"), {}, "env"),  # a pair
+    (Plain(), {"params": Limit(), "max_steps": 5}, "env"),
+    (Plain(), {"params": gymnax.EnvState(time=0)}, "env"),
+    (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "env"),  # whose step is never called
+    (Plain(), {"solved_reward": "high"}, "env.solved_reward"),
+    (Plain(), {"solved_reward": math.nan}, "env.solved_reward"),
+    (Plain(), {"max_steps": 0}, "env.max_steps"),
+])  # fmt: skip
 def test_a_fault_is_told_before_an_agent_trains(env, options, field):
     assert Task(name="mine", env=Plain()).max_steps == 3
     assert refused(Task, name="mine", env=env, **options) == field

@@ -87,19 +87,16 @@ ENV, RN = "env=halfcheetah", "proxy=rn"
 WEIGHTED = "proxy.variant=exclusive_weighted_info"
 
 
-@pytest.mark.parametrize(
-    ("overrides", "field"),
-    [
-        ([ENV, RN, "env.backend=sprung"], "env.backend"),
-        ([ENV, "preset=paper"], "preset"),
-        (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented"),  # has no v
-        (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "proxy.variant"),
-        ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
-        ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
-        ([ENV, RN, "agent=ddqn"], "agent"),
-        (["env=hopper", "env.reset_noise_scale=-1"], "env.reset_noise_scale"),
-        (["env=ant", "env.ctrl_cost_weight=1e31"], "env.ctrl_cost_weight"),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "field"), [
+    ([ENV, RN, "env.backend=sprung"], "env.backend"),
+    ([ENV, "preset=paper"], "preset"),
+    (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented"),  # has no v
+    (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "proxy.variant"),
+    ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
+    ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
+    ([ENV, RN, "agent=ddqn"], "agent"),
+    (["env=hopper", "env.reset_noise_scale=-1"], "env.reset_noise_scale"),
+    (["env=ant", "env.ctrl_cost_weight=1e31"], "env.ctrl_cost_weight"),
+])  # fmt: skip
 def test_what_makes_no_sense_is_refused(overrides, field):
     assert refused(sejax.config, overrides) == field

@@ -38,20 +38,17 @@ def mixture(num=2, weights=(), **config):
 # --- which agent trains where --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("weights", "population_size", "candidates"),
-    [
-        # Shares 1/2, 1/3 and 1/6; after each candidate, share times candidates less those had:
-        # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
-        # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
-        ((3.0, 2.0, 1.0), 12, ([0, 2, 5, 6, 8, 11], [1, 4, 7, 10], [3, 9])),
-        ((1.0, 1.0), 5, ([0, 2, 4], [1, 3])),
-        ((1.0,), 3, ([0, 1, 2],)),
-        # An agent of weight 0 trains on incumbents alone, and needs no candidate.
-        ((0.0, 3.0), 3, ([], [0, 1, 2])),
-        ((0.0, 3.0), 1, ([], [0])),
-    ],
-)
+@pytest.mark.parametrize(("weights", "population_size", "candidates"), [
+    # Shares 1/2, 1/3 and 1/6; after each candidate, share times candidates less those had:
+    # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
+    # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
+    ((3.0, 2.0, 1.0), 12, ([0, 2, 5, 6, 8, 11], [1, 4, 7, 10], [3, 9])),
+    ((1.0, 1.0), 5, ([0, 2, 4], [1, 3])),
+    ((1.0,), 3, ([0, 1, 2],)),
+    # An agent of weight 0 trains on incumbents alone, and needs no candidate.
+    ((0.0, 3.0), 3, ([], [0, 1, 2])),
+    ((0.0, 3.0), 1, ([], [0])),
+])  # fmt: skip
 def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_size, candidates):
     agents = mixture(len(weights), weights=weights)
     assert tuple(x.tolist() for x in agents.deal(population_size)) == candidates
@@ -66,19 +63,16 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
     assert bilevel.strategy.evaluations.num_incumbent_evals == evals
 
 
-@pytest.mark.parametrize(
-    ("make", "field"),
-    [
-        (lambda: Mixture(agents=()), "agents"),
-        (lambda: Mixture(agents=AGENTS, names=("a",)), "agents"),
-        (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
-        (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
-        (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
-        (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
-        (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
-        (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
-    ],
-)
+@pytest.mark.parametrize(("make", "field"), [
+    (lambda: Mixture(agents=()), "agents"),
+    (lambda: Mixture(agents=AGENTS, names=("a",)), "agents"),
+    (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
+    (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
+    (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
+    (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
+    (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
+    (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
+])  # fmt: skip
 def test_a_mixture_that_cannot_be_is_refused(make, field):
     assert refused(make) == field
 

@@ -263,17 +263,14 @@ def unloadable_library(patch):
 
 
 @pytest.mark.parametrize("config", [HalfCheetah(), Hopper()], ids=["halfcheetah", "hopper"])
-@pytest.mark.parametrize(
-    "without",
-    [
-        no_compiler,
-        lambda patch: patch.setenv("CXX", "ls --no-standard-library"),
-        unloadable_library,
-        lambda patch: patch.setitem(sys.modules, "mujoco", None),
-        lambda patch: patch.setitem(sys.modules, "gymnasium", None),
-        lambda patch: patch.setattr(jax, "default_backend", lambda: "gpu"),
-    ],
-)
+@pytest.mark.parametrize("without", [
+    no_compiler,
+    lambda patch: patch.setenv("CXX", "ls --no-standard-library"),
+    unloadable_library,
+    lambda patch: patch.setitem(sys.modules, "mujoco", None),
+    lambda patch: patch.setitem(sys.modules, "gymnasium", None),
+    lambda patch: patch.setattr(jax, "default_backend", lambda: "gpu"),
+])  # fmt: skip
 def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
     config, without, monkeypatch, tmp_path
 ):

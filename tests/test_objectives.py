@@ -44,16 +44,13 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
     assert MaxReward().make(task()).test_params(0) is None
 
 
-@pytest.mark.parametrize(
-    ("config", "scores"),
-    [
-        (MaxReward(), [190.0, 195.0, 200.0]),
-        # -(500 + 100 * (195 - 190)), -(500 + 0), -(400 + 0)
-        (RewardThreshold(unsolved_weight=100.0), [-1000.0, -500.0, -400.0]),
-        (AUC(), np.float32([0, 1 / 500, 2 / 400])),  # of areas 0, 1, 2
-        (AUCSum(), [0, 1, 2]),
-    ],
-)
+@pytest.mark.parametrize(("config", "scores"), [
+    (MaxReward(), [190.0, 195.0, 200.0]),
+    # -(500 + 100 * (195 - 190)), -(500 + 0), -(400 + 0)
+    (RewardThreshold(unsolved_weight=100.0), [-1000.0, -500.0, -400.0]),
+    (AUC(), np.float32([0, 1 / 500, 2 / 400])),  # of areas 0, 1, 2
+    (AUCSum(), [0, 1, 2]),
+])  # fmt: skip
 def test_scores_are_worked_by_hand(config, scores):
     objective = config.make(task(195.0))
     got = objective(outcome([190.0, 195.0, 200.0], [500, 500, 400], [False] * 3))

@@ -92,15 +92,12 @@ def test_a_search_solves_cartpole_and_takes_bonuses_out():
     assert not np.asarray(policy.weights).any()
 
 
-@pytest.mark.parametrize(
-    ("task", "change", "field"),
-    [
-        (CARTPOLE, {"num_top": 7}, "search.num_top"),
-        (CARTPOLE, {"noise_std": 0.0}, "search.noise_std"),
-        (CARTPOLE, {"policy_error": -1.0}, "search.policy_error"),
-        (envs.make("cliff_walking"), {}, "env"),
-    ],
-)
+@pytest.mark.parametrize(("task", "change", "field"), [
+    (CARTPOLE, {"num_top": 7}, "search.num_top"),
+    (CARTPOLE, {"noise_std": 0.0}, "search.noise_std"),
+    (CARTPOLE, {"policy_error": -1.0}, "search.policy_error"),
+    (envs.make("cliff_walking"), {}, "env"),
+])  # fmt: skip
 def test_searches_that_cannot_be_are_refused(task, change, field):
     assert refused(lambda: make_search(dataclasses.replace(SMALL, **change), task)) == field
 

@@ -172,16 +172,13 @@ def test_a_function_of_ones_own_may_be_typed_or_given(tmp_path, monkeypatch):
         assert made().shape == (3,)  # made while something else is traced
 
 
-@pytest.mark.parametrize(
-    "own",
-    [
-        lambda scores: scores[:1],
-        lambda scores: scores.mean(),
-        lambda scores: (scores - scores.mean()) / scores.std(),  # not finite for equal scores
-        lambda scores: scores if scores[0] > 0 else -scores,  # not for JAX
-        lambda scores, incumbent: scores,
-    ],
-)
+@pytest.mark.parametrize("own", [
+    lambda scores: scores[:1],
+    lambda scores: scores.mean(),
+    lambda scores: (scores - scores.mean()) / scores.std(),  # not finite for equal scores
+    lambda scores: scores if scores[0] > 0 else -scores,  # not for JAX
+    lambda scores, incumbent: scores,
+])  # fmt: skip
 def test_a_function_that_gives_no_weights_is_refused(own):
     with pytest.raises(ConfigError) as error:  # of any length: a place in a user's code is not cut
         NESConfig(score_transform=own).make(3)

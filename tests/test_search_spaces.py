@@ -13,21 +13,18 @@ from sejax.searching import config as search_config
 from sejax.searching import spaces
 
 
-@pytest.mark.parametrize(
-    ("text", "distribution"),
-    [
-        ("choice(tanh, relu)", CategoricalDistribution(("tanh", "relu"))),
-        ("tanh,relu", CategoricalDistribution(("tanh", "relu"))),
-        ("choice([32,32], [64])", CategoricalDistribution(("[32,32]", "[64]"))),
-        ("interval(0, 1)", FloatDistribution(0.0, 1.0)),
-        ("int(interval(1, 10))", IntDistribution(1, 10)),
-        ("range(1, 4)", IntDistribution(1, 3)),
-        ("range(16, 65, 16)", IntDistribution(16, 64, step=16)),
-        ("tag(log, interval(0.01, 0.3))", FloatDistribution(0.01, 0.3, log=True)),
-        ("tag(log, int(interval(48, 192)))", IntDistribution(48, 192, log=True)),
-        ("tag(log, inverse, interval(0.9, 0.999))", FloatDistribution(0.001, 0.1, log=True)),
-    ],
-)
+@pytest.mark.parametrize(("text", "distribution"), [
+    ("choice(tanh, relu)", CategoricalDistribution(("tanh", "relu"))),
+    ("tanh,relu", CategoricalDistribution(("tanh", "relu"))),
+    ("choice([32,32], [64])", CategoricalDistribution(("[32,32]", "[64]"))),
+    ("interval(0, 1)", FloatDistribution(0.0, 1.0)),
+    ("int(interval(1, 10))", IntDistribution(1, 10)),
+    ("range(1, 4)", IntDistribution(1, 3)),
+    ("range(16, 65, 16)", IntDistribution(16, 64, step=16)),
+    ("tag(log, interval(0.01, 0.3))", FloatDistribution(0.01, 0.3, log=True)),
+    ("tag(log, int(interval(48, 192)))", IntDistribution(48, 192, log=True)),
+    ("tag(log, inverse, interval(0.9, 0.999))", FloatDistribution(0.001, 0.1, log=True)),
+])  # fmt: skip
 def test_ranges_become_optunas_distributions(text, distribution):
     assert spaces.parse("es.noise_std", text).distribution == distribution
 

@@ -115,16 +115,13 @@ def test_sarsa_equals_a_plain_loop_that_draws_from_the_same_bits():
 # --- exploration ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("numbers", "expected"),
-    [
-        # (init, minimum, decay): 0.8, 0.4, 0.2, then max(0.1, 0.15) = 0.15.
-        ((0.8, 0.15, 0.5), [0.8, 0.4, 0.2, 0.15, 0.15]),
-        ((0.8, 0.1, 0.0), [0.8, 0.1, 0.1, 0.1, 0.1]),
-        # The first episode uses the initial epsilon even below the minimum.
-        ((0.05, 0.1, 0.9), [0.05, 0.1, 0.1, 0.1, 0.1]),
-    ],
-)
+@pytest.mark.parametrize(("numbers", "expected"), [
+    # (init, minimum, decay): 0.8, 0.4, 0.2, then max(0.1, 0.15) = 0.15.
+    ((0.8, 0.15, 0.5), [0.8, 0.4, 0.2, 0.15, 0.15]),
+    ((0.8, 0.1, 0.0), [0.8, 0.1, 0.1, 0.1, 0.1]),
+    # The first episode uses the initial epsilon even below the minimum.
+    ((0.05, 0.1, 0.9), [0.05, 0.1, 0.1, 0.1, 0.1]),
+])  # fmt: skip
 def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(numbers, expected):
     names = ("epsilon_init", "epsilon_min", "epsilon_decay")
     agent = q_learning(**dict(zip(names, numbers, strict=True)))

@@ -211,25 +211,22 @@ def test_weights_that_are_not_finite_are_flagged(weight):
 # --- the stopping rules by hand ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("recent", "num_episodes", "flat"),
-    [
-        # Windows of 2, tolerance 1 %. Older mean 100: newer may be 99 to 101.
-        ([100, 100, 100.5, 101.3], 4, True),  # newer 100.9
-        ([100, 100, 101, 101.4], 4, False),  # newer 101.2
-        ([-100, -100, -100.4, -101.2], 9, True),  # relative to the magnitude: 0.8 of 1
-        ([50, -50, 0, 0], 4, True),  # older 0, newer 0
-        ([50, -50, 0, 0.1], 4, False),  # older 0: nothing but 0 is close
-        # Three episodes 5, 5, 5: the older window holds one of them, whose mean is 5.
-        ([0, 5, 5, 5], 3, True),
-        ([0, 4, 5, 5], 3, False),
-        # One episode: newer is its return, older 0.
-        ([0, 0, 0, 5], 1, False),
-        # Windows of 3, five episodes: older (2.01 + 2) / 2 = 2.005, newer 2.
-        ([0, 2.01, 2, 3, 2, 1], 5, True),
-        ([1, 1, 1, np.nan], 4, False),
-    ],
-)
+@pytest.mark.parametrize(("recent", "num_episodes", "flat"), [
+    # Windows of 2, tolerance 1 %. Older mean 100: newer may be 99 to 101.
+    ([100, 100, 100.5, 101.3], 4, True),  # newer 100.9
+    ([100, 100, 101, 101.4], 4, False),  # newer 101.2
+    ([-100, -100, -100.4, -101.2], 9, True),  # relative to the magnitude: 0.8 of 1
+    ([50, -50, 0, 0], 4, True),  # older 0, newer 0
+    ([50, -50, 0, 0.1], 4, False),  # older 0: nothing but 0 is close
+    # Three episodes 5, 5, 5: the older window holds one of them, whose mean is 5.
+    ([0, 5, 5, 5], 3, True),
+    ([0, 4, 5, 5], 3, False),
+    # One episode: newer is its return, older 0.
+    ([0, 0, 0, 5], 1, False),
+    # Windows of 3, five episodes: older (2.01 + 2) / 2 = 2.005, newer 2.
+    ([0, 2.01, 2, 3, 2, 1], 5, True),
+    ([1, 1, 1, np.nan], 4, False),
+])  # fmt: skip
 def test_a_plateau_compares_the_last_window_with_the_one_before(recent, num_episodes, flat):
     recent = jnp.array(recent, jnp.float32)
     assert bool(is_plateau(recent, jnp.int32(num_episodes), 0.01)) == flat
