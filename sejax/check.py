@@ -152,7 +152,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
         rows[TUNED] = on_task, ["tuned"]
         rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
         table = _trained(config, rows, store)
-        return _told(proxy, null, [*learned], table, folder)
+        return _reported(proxy, null, [*learned], table, folder)
 
 
 # --- who trains where -----------------------------------------------------------------------------
@@ -210,7 +210,7 @@ def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
 # --- what was found -------------------------------------------------------------------------------
 
 
-def _told(
+def _reported(
     proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
 ) -> dict[str, Any]:
     """Prints and writes the findings. Scores are returns for an SE, training steps for an RN."""

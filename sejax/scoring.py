@@ -27,8 +27,7 @@ class Scores:
     Attributes:
       population: one for each training, candidate by candidate; not finite for agents that
         diverged.
-      incumbent: one for each training, the agents of a mixture in turns; agents that diverged rank
-        last.
+      incumbent: one for each training, `[turn, agent]` flattened; agents that diverged rank last.
       agent_means: the incumbent's mean with each agent of a mixture; nan if all of them diverged.
       incumbent_mean: the incumbent's score; nan if all trainings with one of the agents diverged.
       diverged: whether the score of a training is not finite; the incumbent's trainings come last.

@@ -42,7 +42,8 @@ class TrainingConfig(Options):
       stop_rule: plateau (SEs), solved (real tasks)
       window: d: episodes in each of the two means that the plateau rule compares
       plateau_tolerance: C_diff: relative change between them that counts as flat
-      solved_by: Whether the last d test or training returns must reach the solved reward.
+      solved_by: test or train: whose mean return of the last d episodes must reach the solved
+        score, for stop_rule=solved
       test_episodes: n_te: greedy episodes on the real task after training
       tests_between: Greedy episodes on the real task after each training episode; at least one
         with stop_rule=solved and solved_by=test.

@@ -36,7 +36,7 @@ PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
 KIND = "sejax"  # name of the metadata's entry
 # Fields that older files lack, with the defaults of that time.
-UNSAID = {"training": {"time_limit_is_terminal": True}}
+OLD_DEFAULTS = {"training": {"time_limit_is_terminal": True}}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -224,7 +224,7 @@ def training_of(
     must = f"must be given for {shortened(env.name)}, whose file does not tell it"
     fix = "Set training=sejax.TrainingConfig(...)"
     require(isinstance(stored, Mapping), "training", f"{must}; got none. {fix}.")
-    training = from_plain(TrainingConfig, header.UNSAID["training"] | stored, "training")
+    training = from_plain(TrainingConfig, header.OLD_DEFAULTS["training"] | stored, "training")
     if agent is None:
         return training
     agents = agents_of(config).values()

@@ -304,7 +304,7 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     """
     # A proxy's file names neither the tracker of its run nor the machines.
     unsaid = {"tracker": {"name": "none"}, "machines": {"name": "local"}}
-    return _from_plain(LearnConfig, merge(unsaid, header.UNSAID, values), imports)
+    return _from_plain(LearnConfig, merge(unsaid, header.OLD_DEFAULTS, values), imports)
 
 
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
@@ -467,7 +467,7 @@ def _learned(values: Mapping[str, Any]) -> dict[str, Any]:
     if stored is None:
         return {}
     if learned and not words and hparams in (None, "as_learned"):
-        said = flatten(merge(header.UNSAID, stored.config))
+        said = flatten(merge(header.OLD_DEFAULTS, stored.config))
         limit = {"time_limit_is_terminal": said.get("training.time_limit_is_terminal")}
         choices = {"agents": learned, "exploration": explored, "real_training": limit}
         return choices | {"agent_hparams": "as_learned"}

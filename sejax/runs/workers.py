@@ -35,7 +35,7 @@ from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
-Portion: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
+WorkShare: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
 BATCH = 16  # trainings in a share if neither the agent nor the user says how many
 Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
 RETRIES = 20  # how often Ray sends a share again if its worker dies
@@ -190,7 +190,7 @@ class RemoteChunks(Chunks):
     def __init__(
         self,
         config: LearnConfig,
-        compute: Callable[[Sequence[Portion]], Sequence[tuple[Outcome, float]]],
+        compute: Callable[[Sequence[WorkShare]], Sequence[tuple[Outcome, float]]],
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._compute = compute
@@ -246,7 +246,7 @@ class RemoteChunks(Chunks):
 
     def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
         """The outcomes of each agent's trainings, leaves `[training, ...]`."""
-        shares: list[Portion] = []
+        shares: list[WorkShare] = []
         for agent_index, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
             for start in range(0, len(trainings.active), size):
                 part = slice(start, start + size)
@@ -309,7 +309,7 @@ def _on_cluster(
 # --- a worker -------------------------------------------------------------------------------------
 
 
-def score(setup: str, share: Portion) -> tuple[Outcome, float]:
+def score(setup: str, share: WorkShare) -> tuple[Outcome, float]:
     """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
     (agent_index, trainings), started = share, time.process_time()
     size, program = _programs(setup)[agent_index]
