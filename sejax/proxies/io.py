@@ -335,7 +335,7 @@ def save_set(
             task=env.task.name,
             interface=env.task.interface,
             # Without the folder, which is a path on the machine of the run.
-            config={**known, **(config or {}), **known, "run_dir": None},
+            config={**known, **(config or {}), "run_dir": None},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
