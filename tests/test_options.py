@@ -73,10 +73,10 @@ def test_a_value_at_the_edge_of_its_rule_is_taken(field, values):
 # --- what is traced, and what is varied ----------------------------------------------------------
 
 
-def test_a_subclass_that_changes_a_default_keeps_marks_and_help_text():
+def test_a_subclass_that_changes_a_default_keeps_bounds_marks_and_help_text():
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Mine(QLearningConfig):
-        learning_rate: options.Positive = 0.5
+        learning_rate: float = 0.5
 
     assert traced_options(Mine())["learning_rate"] == 0.5
     assert "agent.learning_rate=0.5." in str(refusal(Mine, learning_rate=0))

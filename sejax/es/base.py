@@ -14,7 +14,7 @@ from sejax.ops.scores import finite_mean
 from sejax.options import LEAST, Count, Options
 
 # A number of candidates, each with the weights of a proxy.
-PopulationSize = Annotated[int, Field(ge=2, le=100_000)]
+NumMembers = Annotated[int, Field(ge=2, le=100_000)]
 # Larger steps or noise lead to weights whose products are not finite.
 Scale = Annotated[float, Field(ge=LEAST, le=1e6)]
 
@@ -137,7 +137,7 @@ class StrategyOptions(Options):
 
     group: ClassVar[str] = "es"
 
-    population_size: PopulationSize = 16
+    population_size: NumMembers = 16
     num_evals: Count = 1
     eval_aggregate: Literal["mean", "min"] = "mean"
     common_random_numbers: bool = False

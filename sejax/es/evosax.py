@@ -11,14 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import (
-    Evaluations,
-    PopulationSize,
-    Scale,
-    Strategy,
-    StrategyOptions,
-    StrategyState,
-)
+from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
 from sejax.options import Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second
@@ -53,7 +46,7 @@ class EvosaxConfig(StrategyOptions):
     """
 
     name: str = "open_es"
-    population_size: PopulationSize = 32
+    population_size: NumMembers = 32
     num_incumbent_evals: Count = 16
     noise_std: Scale = 0.05
     noise_std_decay: Decay = 1.0

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.es.base import PopulationSize, Scale, Strategy, StrategyOptions
+from sejax.es.base import NumMembers, Scale, Strategy, StrategyOptions
 from sejax.es.score_transforms import FIELD, TRANSFORMS, OwnTransform, transform_of
 from sejax.ops.scores import or_minus_inf
 from sejax.options import Count, Decay, Fraction, option, registry, require_known
@@ -38,7 +38,7 @@ class NESConfig(StrategyOptions):
       weight_decay: psi shrinks by this fraction before each update
     """
 
-    population_size: PopulationSize = 64
+    population_size: NumMembers = 64
     num_incumbent_evals: Count | None = 16
     noise_std: Scale = 0.06
     noise_std_decay: Decay = 0.97

@@ -208,15 +208,22 @@ class Options:
 
 
 def hints_of(cls: type, where: str) -> dict[str, Any]:
-    """The types of a dataclass's fields, with their bounds.
+    """The types of a dataclass's fields, with their bounds; a plain type keeps those of a base.
+
+    So `warmup_episodes: int = 5` in a subclass changes only the default.
 
     Raises:
       ConfigError: for a type that is not known where the class is defined.
     """
     try:
-        return typing.get_type_hints(cls, include_extras=True)
+        hints, *bounded = (typing.get_type_hints(x, include_extras=True) for x in cls.__mro__)
+        plain, *others = (typing.get_type_hints(x) for x in cls.__mro__)
     except NameError as error:
         raise ConfigError(f"{where} must have fields of known types: {error}.", where) from error
+    for of_base, plain_of_base in zip(bounded, others, strict=True):
+        same = [x for x in of_base if plain_of_base[x] == plain[x] == hints[x]]
+        hints |= {name: of_base[name] for name in same}
+    return hints
 
 
 def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> Any:
@@ -276,7 +283,7 @@ def traced_options(config: Options) -> dict[str, Any]:
 def marks(cls: type, name: str) -> dict[str, Any]:
     """The metadata of a field; a subclass inherits the marks that it does not set.
 
-    So `warmup_episodes: int = 5` in a subclass changes only the default.
+    So a subclass may change a default alone.
     """
     fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
