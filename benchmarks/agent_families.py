@@ -27,7 +27,7 @@ from typing import Any
 import common
 
 import sejax
-from sejax.options import registry
+from sejax.options.plain import configure
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -65,9 +65,9 @@ class Family:
         elif self.agent == "ppo":
             agent = sejax.PPOConfig.paper()
         else:
-            agent = registry.configure("agent", {"name": self.agent, **PAPERS.get(self.agent, {})})
+            agent = configure("agent", {"name": self.agent, **PAPERS.get(self.agent, {})})
         agent = replace(agent, warmup_episodes=0)
-        limit = registry.configure("env", {"name": self.env}).spec.max_steps
+        limit = configure("env", {"name": self.env}).spec.max_steps
         phase = agent.steps_before_learning(limit, limit)  # 0 but for PPO
         steps = max(2, -(-steps // phase)) * phase if phase else steps
         training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)

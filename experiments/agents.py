@@ -32,7 +32,8 @@ from sejax.envs import with_one_done
 from sejax.envs.wrappers import repeat_actions
 from sejax.evaluation import make_tester
 from sejax.gym import GYMNASIUM_IDS
-from sejax.options import Count, registry
+from sejax.options import Count
+from sejax.options.plain import configure, to_plain
 
 TEST_EPISODES = 10
 SIZES = {"hidden_size": 64, "num_layers": 2}  # as rejax's DQN has them
@@ -103,7 +104,7 @@ class Cell:
             values |= {"epsilon_min": 0.05, "exploration_steps": self.steps // 10}
         else:
             values["action_repeat"] = action_repeat
-        return registry.configure("agent", values | {"name": self.agent})
+        return configure("agent", values | {"name": self.agent})
 
     def options(self, names: dict[str, str]) -> dict[str, Any]:
         """The hyperparameters as another library calls them: its own name, or `THEIRS=OURS`."""
@@ -277,7 +278,7 @@ def compute(settings: Agents) -> pd.DataFrame:
         for cell in cells_of(library, settings):
             columns = {"task": cell.task, "agent": cell.agent, "steps": cell.steps}
             made_with = columns | {"library": library, "random_steps": TASKS[cell.task][4]}
-            made_with["agent"] = registry.describe("agent", cell.config)
+            made_with["agent"] = to_plain(cell.config, "agent")
             train = functools.cache(functools.partial(TRAINERS[library], cell))
             for seed in range(settings.seed, settings.seed + number):
                 name = f"{cell.task}-{cell.agent}-{library}-{seed:04d}"

@@ -27,7 +27,8 @@ from experiments.common.statistics import worst_tenth
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
 from sejax.myopia import MARGIN, judge
-from sejax.options import Count, registry, require
+from sejax.options import Count, require
+from sejax.options.plain import configure
 from sejax.proxies import header
 
 STORED = (  # below results/
@@ -108,9 +109,9 @@ MEASURE = dataclasses.replace(agents.OUTCOMES, make_run=make_run)
 def agent_on(settings: SeMyopia, ses: ProxySet) -> Any:
     """DDQN, or TD3, as the set was learned with it; else as it is tuned for the task."""
     kind = agents.usual_kind(ses.task)
-    for values in header.agents_of(ses.config).values():
+    for values in ses.config["agents"].values():
         if values["name"] == kind:
-            return registry.configure("agent", values)
+            return configure("agent", values)
     return agents.tuned_agent(settings.env, kind)
 
 

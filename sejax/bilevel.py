@@ -118,7 +118,7 @@ class Bilevel:
         return Candidates(
             population=population,
             incumbent=self.strategy.incumbent(es_state),
-            keys=self.strategy.evaluations.keys(key_inner, len(population), mixture.size),
+            keys=self.scoring.evaluations.keys(key_inner, len(population), mixture.size),
             active=~state.solved,
             test_params=objective.test_params(state.generation),
             key_tell=key_tell,
@@ -249,7 +249,7 @@ def make_bilevel(
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,
-        strategy=dataclasses.replace(strategy, evaluations=scoring.evaluations),
+        strategy=strategy,
         scoring=scoring,
         evaluate=GenerationEvaluator(proxy, unravel, training, scoring, devices, num_parallel),
         unravel=unravel,

@@ -20,7 +20,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import jax
 import pandas as pd
@@ -33,16 +33,17 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted
 from sejax.envs.base import Task
-from sejax.evaluate import World, loaded, print_table, setup_of, summarise, train
+from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import LEAST, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import LARGEST, Count, as_text, registry, require
+from sejax.options.plain import configure, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
-from sejax.runs.config import REAL_TRAINING, EvaluateConfig
+from sejax.runs.config import REAL_TRAINING
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
@@ -71,9 +72,7 @@ class CheckConfig(EvaluateConfig):
         that follows if the search does not solve the task
     """
 
-    groups: ClassVar[tuple[str, ...]] = ("exploration", "machines")
-
-    machines: Any
+    machines: Any = plugin("machines")
     algorithms: tuple[str, ...] | None = None
     null_steps: Count = 200_000
     num_agents: Annotated[int, Field(ge=LEAST, le=LARGEST)] = 20
@@ -92,12 +91,12 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     runtime.configure_jax()
-    run(configuration.evaluate_config(overrides, CheckConfig))
+    run(configuration.config(overrides, CheckConfig))
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(CheckConfig, overrides)}"
+    return f"{__doc__}\n{configuration.help_text(CheckConfig, ['proxy=RUN_DIR', *overrides])}"
 
 
 def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
@@ -114,7 +113,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
       ConfigError: for an invalid field, or a proxy that cannot be judged.
     """
     words = [f"{name}={as_text(value)}" for name, value in {"proxy": proxy, **fields}.items()]
-    return run(configuration.evaluate_config(words, CheckConfig))
+    return run(configuration.config(words, CheckConfig))
 
 
 def run(config: CheckConfig) -> dict[str, Any]:
@@ -128,7 +127,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
-    others = {x: registry.configure("agent", {"name": x}) for x in names if x not in same}
+    others = {x: configure("agent", {"name": x}) for x in names if x not in same}
     myopic = dict[str, dict[str, AgentConfig]]()
     students = learned | others | {"tuned": _tuned(task)}
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
@@ -163,7 +162,7 @@ def _tuned(task: Task) -> AgentConfig:
     name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
     beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
     fields = beside.get("agent", {}) | {"name": name, "warmup_episodes": 1}
-    return registry.configure("agent", fields)
+    return configure("agent", fields)
 
 
 def _null(

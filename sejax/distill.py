@@ -27,8 +27,8 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, Options, field_lines, require, shortened
-from sejax.options.plain import fields_of, flatten, from_plain, merge, to_plain
+from sejax.options import ConfigError, Count, Options, field_lines, shortened
+from sejax.options.plain import flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -104,17 +104,12 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     Raises:
       ConfigError: for invalid overrides.
     """
-    values: dict[str, Any] = {}
-    others = {}
-    for name, text in compose.words(overrides).items():
-        group, _, field = name.partition(".")
-        if group in fields_of(DistillConfig):
-            values = merge(values, {group: {field: text} if field else text})
-        else:
-            fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-            message = f"must be left out, as it has no effect here. {fix}"
-            require(group in TAKEN, shortened(name, 40), message)
-            others[name] = f"{name}={text}"
+    values, texts = compose.partition(overrides, DistillConfig)
+    for name in [name for name in texts if name.partition(".")[0] not in TAKEN]:
+        fix = "Set search.generations=N." if name == "generations" else "Leave it out."
+        message = f"must be left out, as it has no effect here. {fix}"
+        raise ConfigError(f"{shortened(name, 40)} {message}", name)
+    others = {name: f"{name}={text}" for name, text in texts.items()}
     task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
     actions = envs.spec_of(task.env).actions
     steps = others.get("training.max_steps", STEPS[actions]).rpartition("=")[2]

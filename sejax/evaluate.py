@@ -9,13 +9,15 @@ Writes evaluation.csv and .json into out_dir. --print-config prints the configur
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import pandas as pd
@@ -26,12 +28,14 @@ from sejax import agents, envs
 from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
 from sejax.ops.files import as_file_name, require_writable, write_text
-from sejax.options import registry, require
+from sejax.options import ConfigError, Count, option, registry, require, shortened
+from sejax.options.plain import configure, flatten, to_plain
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
-from sejax.runs.config import EvaluateConfig
+from sejax.runs.compose import Tree
+from sejax.runs.config import REAL_TRAINING, TRAINING, CommandConfig, default_agent
 from sejax.training import TrainingConfig
 
 # Columns of the table: what they show, and with how many digits.
@@ -52,6 +56,95 @@ class World(NamedTuple):
     is_varied: bool = False  # whether hyperparameters are random for each agent
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(CommandConfig):
+    """What `sejax.evaluate` takes.
+
+    Attributes:
+      proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
+      env: the task, if proxy=real or if the proxy's task is your own
+      proxy_kind: my_module:MyProxy, if the proxy's class is your own
+      agent_hparams: as_learned: agents and exploration that the proxy was learned with, if no
+        agent is named; default: the agent's; varied: drawn around the default for each agent.
+      training_from: How long agents train on the proxy. proxy: on an SE as in the run that learned
+        it, on a reward network as on the real task; config: as `training` says.
+      baseline: whether as many agents train on the real task, for comparison
+      out_dir: null: beside the proxy (runs/evaluate-<name> if the proxy has no folder)
+      real_training: Training on the real task. Its test_episodes hold on the proxy too, unless
+        training_from=config. Agents as_learned keep the time_limit_is_terminal of the run.
+    """
+
+    proxy: str
+    env: str | None = option(None, names_code=True)
+    proxy_kind: str | None = option(None, names_code=True)
+    agent_hparams: Literal["default", "varied", "as_learned"] = "default"
+    training_from: Literal["proxy", "config"] = "proxy"
+    num_agents: Count = 10
+    baseline: bool = True
+    out_dir: str | None = None
+    real_training: TrainingConfig = REAL_TRAINING
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
+            is_idle = self.proxy == "real" and getattr(self, name) == idle
+            require(not is_idle, name, f"must be left out with proxy=real; got {idle}.")
+        default, training = to_plain(TRAINING), to_plain(self.training).items()
+        changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
+        fix = "" if self.proxy == "real" else "training_from=config, or "
+        message = f"must be left out, as it is idle here; got {changed}. Set {fix}real_training.*."
+        require(self.training_from == "config" or not changed, "training", message)
+
+    @classmethod
+    def layers_below(cls, words: Tree, imports: Collection[str]) -> dict[str, Tree]:
+        """What agents take from the run that learned the proxy.
+
+        If no word names an agent, all of the proxy's agents train, with their exploration and the
+        run's `time_limit_is_terminal`. A typed agent that the proxy was learned with has the
+        proxy's hyperparameters. If the file has no agents, the task's default one trains.
+
+        Raises:
+          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words set agents or
+            exploration, or if the file does not tell its agents.
+        """
+        fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
+        require("proxy" in words, "proxy", f"must be given. {fix}")
+        hparams = words.get("agent_hparams")
+        typed = [name for name in ("agents", "agent", "exploration") if words.get(name)]
+        must = f"must be left out with agent_hparams={hparams}; got {', '.join(typed)}"
+        is_typed = bool(typed) and hparams == "as_learned" and words["proxy"] != "real"
+        require(not is_typed, (typed or [""])[0], f"{must}. Set agent_hparams=default.")
+        stored, learned, default = None, Tree(), ""
+        try:
+            if words["proxy"] != "real":
+                stored = header.read(str(words["proxy"]), "proxy").header
+                default, learned = agents.default_for(stored.spec), learned_with(stored.config)
+        except ConfigError:  # loading the proxy raises it later
+            if hparams == "as_learned":
+                raise
+        must = "must be left out for a proxy whose file tells no agents that sejax knows"
+        require(learned or not stored or hparams != "as_learned", "agent_hparams", f"{must}.")
+        if learned and not typed and hparams in (None, "as_learned"):
+            return {"proxy": learned | {"agent_hparams": "as_learned"}}
+        default = default or default_agent({"name": words.get("env", "cartpole")}, imports)
+        names = compose.names_of(words["agents"]) or {default: default}
+        of_agents = learned.get("agents", {}).values() if hparams is None else ()
+        by_name = {agent["name"]: agent for agent in of_agents}
+        of_names = {key: by_name.get(name, {"name": name}) for key, name in names.items()}
+        return {"proxy": {"agents": of_names}}
+
+
+def learned_with(config: Mapping[str, Any]) -> Tree:
+    """What a stored configuration says of its agents; empty if one of them is not registered."""
+    explored = config.get("exploration", {"name": "none"})
+    are_known = [header.is_registered("agent", agent) for agent in config["agents"].values()]
+    if not are_known or not all([*are_known, header.is_registered("exploration", explored)]):
+        return {}
+    limit = flatten(config).get("training.time_limit_is_terminal", True)
+    limits = {"time_limit_is_terminal": limit}
+    return {"agents": config["agents"], "exploration": explored, "real_training": limits}
+
+
 def main(overrides: Sequence[str]) -> None:
     """Evaluates each configuration that the overrides describe.
 
@@ -67,12 +160,12 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(EvaluateConfig, overrides)}"
+    return f"{__doc__}\n{configuration.help_text(EvaluateConfig, ['proxy=RUN_DIR', *overrides])}"
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
-    make = configuration.evaluate_config
+    make = functools.partial(configuration.config, command=EvaluateConfig)
     return compose.swept(overrides, make, "out_dir", lambda _, name: f"runs/evaluate-{name}")
 
 
@@ -123,8 +216,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
         task, real_training = proxy.task, config.real_training
     trainings = {}
     for key, agent in config.agents.items():
-        field = compose.field_of(key, config.agents)
-        agents.require_fit(agent, config.exploration, task, task.name, field)
+        agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
         group, training = "real_training", real_training
         if config.training_from == "config":
             group, training = "training", config.training
@@ -160,10 +252,10 @@ def loaded(config: EvaluateConfig) -> Proxy:
     task = proxy_config = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
-        task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
+        task = envs.make_from(configure("env", {**fields, "name": config.env}))
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
-        proxy_config = registry.configure("proxy", fields)
+        proxy_config = configure("proxy", fields)
     proxy = load_proxy(path, task, proxy_config, "proxy")
     name = proxy.task.name
     is_same = config.env in (None, name, proxy.config["env"].get("name"))

@@ -10,9 +10,8 @@ python -m sejax.run.
 """
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 
-from sejax.options import ConfigError, field_lines, require, told
+from sejax.options import ConfigError, field_lines, require_package, told
 from sejax.options.plain import to_plain
 from sejax.runs import commands, runtime
 
@@ -24,7 +23,7 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides or a study that cannot be searched, or without Optuna.
       OSError: if a file cannot be written.
     """
-    require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
+    require_package("sejax.search", "optuna", "search")
     from sejax.searching import config, study
 
     search = config.read(overrides)
@@ -45,7 +44,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    require(find_spec("optuna"), "sejax.search", "needs Optuna. Run pip install 'sejax[search]'.")
+    require_package("sejax.search", "optuna", "search")
     from sejax.searching.config import StudyConfig
 
     lines = field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})

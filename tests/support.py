@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.proxies.synthetic import SyntheticConfig
+from sejax.runs.config import config
 from sejax.training import TrainingConfig
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.
@@ -216,6 +218,11 @@ def ended(monkeypatch, capsys, command, *words):
 def has_compiler():
     """Whether MuJoCo's library can be built here."""
     return shutil.which((os.environ.get("CXX") or "c++").split()[0]) is not None
+
+
+def evaluation(words):
+    """The configuration of an evaluation."""
+    return config(words, EvaluateConfig)
 
 
 def refusal(call, *args, **kwargs):

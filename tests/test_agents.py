@@ -11,8 +11,9 @@ from support import assert_close, assert_equal, refused
 
 import sejax
 from sejax import agents, envs, make_agent, make_trainer
-from sejax.agents import AgentConfig, Transition
-from sejax.options import registry, traced_options
+from sejax.agents import AgentConfig, Transition, traced
+from sejax.options import registry
+from sejax.options.plain import configure
 
 NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
 SMALL = {
@@ -27,11 +28,11 @@ TASKS = ("cartpole", "pendulum", "gridworld_2x2")  # discrete, continuous, and a
 def config_of(name):
     """A small configuration of a registered agent."""
     fields = {field.name for field in dataclasses.fields(registry.find("agent", name))}
-    return registry.configure("agent", {"name": name} | {k: SMALL[k] for k in SMALL if k in fields})
+    return configure("agent", {"name": name} | {k: SMALL[k] for k in SMALL if k in fields})
 
 
 def fits(name, task):
-    spec = envs.spec_of(registry.configure("env", {"name": task}))
+    spec = envs.spec_of(configure("env", {"name": task}))
     config = registry.find("agent", name)
     return config.states in (None, spec.states) and spec.actions in config.actions
 
@@ -56,7 +57,7 @@ def parts(case):
     task = envs.make(task_name)
     small = {"hidden_size": 4, "num_layers": 1, "num_residual_blocks": 1, "feature_dim": 3}
     fields = {"name": exploration} | (small if exploration == "icm" else {})
-    exploration = registry.configure("exploration", fields)
+    exploration = configure("exploration", fields)
     agent = agents.make_agent(config_of(name), task, exploration)
 
     def start(key, hparams):
@@ -134,7 +135,7 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     _, agent, _ = parts(case)
     config = config_of(case[0])
     hparams = agent.hparams if case[2] == "none" else agent.hparams.agent
-    options = traced_options(config)
+    options = vars(traced(config))
     assert options.items() <= vars(hparams).items()
     assert {"learning_rate", "discount"} <= set(options)
     assert agent.discount(agent.hparams) == 0.9

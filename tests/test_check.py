@@ -31,7 +31,7 @@ def save(path, *words):
 
 
 def run(path, **fields):
-    return checking.run(configuration.evaluate_config(
+    return checking.run(configuration.config(
         [f"{name}={value}" for name, value in {"proxy": path, **FEW, **fields}.items()],
         checking.CheckConfig))  # fmt: skip
 

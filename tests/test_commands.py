@@ -44,9 +44,12 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path, monkeypatch, cap
 # --- what people type ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("words", [["--env", "cartpole"], ["--env=cartpole", "seed=1"]])
-def test_an_option_with_dashes_is_answered_with_an_override(words):
-    assert "Write env=cartpole" in str(refusal(sejax.config, words))
+@pytest.mark.parametrize(("words", "fix"), [
+    (["--env", "cartpole"], "Write env=VALUE."), (["--env=cartpole"], "Write env=cartpole."),
+    (["acrobot"], "Write env=acrobot or proxy=acrobot."), (["env"], "Write env=VALUE."),
+])  # fmt: skip
+def test_what_is_no_override_is_answered_with_one(words, fix):
+    assert fix in str(refusal(sejax.config, words))
 
 
 @pytest.mark.parametrize("words", [[], ["--help"]])

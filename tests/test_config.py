@@ -7,17 +7,19 @@ import sys
 
 import pytest
 import yaml
-from support import ended, printed, refusal
+from support import ended, evaluation, printed, refusal
 
 import sejax
 from sejax import distill, evaluate, run
+from sejax.agents.mixture import MixtureConfig
 from sejax.distill import DistillConfig
+from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.compose import expand
-from sejax.runs.config import EvaluateConfig, LearnConfig, evaluate_config
+from sejax.runs.config import LearnConfig
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"]
 
@@ -75,9 +77,11 @@ def test_values_are_read_by_the_types_of_their_fields():
 
 
 def test_each_agent_of_a_mixture_has_fields_and_may_have_a_name_of_its_own():
-    config = sejax.config([*OWN_NAME, "agents.myopic.weight=2", "agents.aggregate=min"])
+    words = ["mixture.weights.myopic=2", "mixture.aggregate=min"]
+    config = sejax.config([*OWN_NAME, *words])
+    assert config == sejax.config([*OWN_NAME, "agents.myopic.weight=2", "agents.aggregate=min"])
     sighted, myopic = config.agents.values()
-    assert (config.mixture.aggregate, config.weights) == ("min", (1.0, 2.0))
+    assert config.mixture == MixtureConfig(aggregate="min", weights={"ddqn": 1, "myopic": 2})
     assert sighted == sejax.config([]).agent, "with the settings of its preset"
     assert myopic == dataclasses.replace(sighted, discount=0.0)
     agent = config.parts()["agent"]
@@ -93,14 +97,14 @@ def test_each_agent_of_a_mixture_has_the_settings_that_it_has_alone(preset):
 
 @pytest.mark.parametrize("name", ["cartpole", "cliff_walking-rn"])
 def test_evaluate_trains_the_agents_that_a_proxy_was_learned_with(name):
-    config = evaluate_config([f"proxy={name}"])
+    config = evaluation([f"proxy={name}"])
     learned = sejax.load_proxy(name).learned_agents()
     assert config.agents == learned and config.agent_hparams == "as_learned"
     for key, agent in learned.items():  # as one that is named, too
         words = [f"proxy={name}", f"agent={key}"]
-        changed = evaluate_config([*words, "agent.discount=0.5"]).agent
+        changed = evaluation([*words, "agent.discount=0.5"]).agent
         assert changed == dataclasses.replace(agent, discount=0.5)
-        assert evaluate_config([*words, "agent_hparams=default"]).agent == type(agent)()
+        assert evaluation([*words, "agent_hparams=default"]).agent == type(agent)()
 
 
 def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
@@ -110,16 +114,16 @@ def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
         sejax.save(tmp_path / "x.safetensors", env, params.weights, config, 0.8)
         proxy = sejax.load_proxy(tmp_path / "x.safetensors")
         assert (sejax.agent_of(proxy).varied is not None) == (hparams == "varied")
-        worlds, _ = evaluate.setup_of(evaluate_config([f"proxy={proxy.path}"]))
+        worlds, _ = evaluate.setup_of(evaluation([f"proxy={proxy.path}"]))
         assert {world.is_varied for world in worlds.values()} == {hparams == "varied"}
 
 
 def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():
     learned = sejax.load_proxy("cartpole").learned_agents()
-    config = evaluate_config(["proxy=cartpole", "agents=[ppo,sac]", "agents.ppo.epochs=3"])
+    config = evaluation(["proxy=cartpole", "agents=[ppo,sac]", "agents.ppo.epochs=3"])
     expected = {"ppo": dataclasses.replace(learned["ppo"], epochs=3), "sac": sejax.SACConfig()}
     assert config.agents == expected and config.agent_hparams == "default"
-    config = evaluate_config(["proxy=cartpole", "agent.discount=0.5"])  # of the task's own agent
+    config = evaluation(["proxy=cartpole", "agent.discount=0.5"])  # of the task's own agent
     assert config.agent == dataclasses.replace(learned["ddqn"], discount=0.5)
 
 
@@ -154,7 +158,7 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
 
 
 @pytest.mark.parametrize("overrides", [
-    [], ["env=cliff_walking", "proxy=rn"], [*OWN_NAME, "agents.myopic.weight=2"],
+    [], ["env=cliff_walking", "proxy=rn"], [*OWN_NAME, "mixture.weights.myopic=2"],
     ["es=snes", "env=gymnax/Catch-bsuite"],
 ])  # fmt: skip
 def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, overrides):
@@ -204,12 +208,12 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
     ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
     ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
-    ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
+    ("mixture.aggregate=min", "mixture", "agents=[ddqn,ppo]"),
     ("preset=paper env=mountain_car", "preset", "preset=best"),
     (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
     ("es.population_size=1.5", "es.population_size", ""), ("agents=[ddqn,td3]", "agents.td3", ""),
     ("stop_when_solved=maybe", "stop_when_solved", ""), ("agents=[ddqn,ddqn]", "agents", ""),
-    ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
+    ("agents=[ddqn,ppo] mixture.weights.ddqn=-1", "mixture.weights.ddqn", ""),
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
     ("proxy=rn stop_when_solved=true", "stop_when_solved", "=false"),
@@ -232,10 +236,10 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
     ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
-    ("proxy=cartpole agents=[ddqn,ppo] agents.ppo.weight=2", "agents.ppo.weight"),
+    ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture"),
 ])  # fmt: skip
 def test_what_evaluate_cannot_use_is_refused(override, field):
-    assert refused(*override.split(), make=evaluate_config).field == field
+    assert refused(*override.split(), make=evaluation).field == field
 
 
 def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
@@ -243,7 +247,7 @@ def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
     rng = random.Random(0)
     fields = ("batch_size", "noise_std", "hidden_size", "max_steps", "activation", "done", "nope")
     groups = ("agent", "es", "proxy", "training", "objective")
-    names = [*LearnConfig.groups, "preset", "seed", "generations", "devices", "agents"]
+    names = [*LearnConfig.groups(), "preset", "seed", "generations", "devices", "agents"]
     names += [f"{group}.{field}" for group in groups for field in fields]
     texts = "0 1 -1 2.5 1e-3 64 nan inf null true [] [1] [ [ddqn] x ddqn ppo acrobot rn relu paper"
     texts += " threshold ' ☃ a:b ${x} {a:1} 0x10 1_000 ~ ??? 99999999999999999999"
@@ -283,14 +287,14 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
 
 @pytest.mark.parametrize(("module", "words", "schema", "expected"), [
     (run, [], LearnConfig, ["agent.batch_size=64  # transitions", "preset=best", "env: cartpole"]),
-    (run, ["agents=[ddqn,ppo]"], LearnConfig, ["agents.ddqn.weight=1.0  # share"]),
+    (run, ["agents=[ddqn,ppo]"], LearnConfig, ["mixture.weights.ddqn=1.0  # share"]),
     (run, ["preset=paper", "seed=3"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
     (evaluate, ["proxy=cartpole"], EvaluateConfig, ["agents.ppo.epochs=10  # passes", "(proxy)"]),
     (distill, [], DistillConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
 ])  # fmt: skip
 def test_help_shows_each_field_with_its_value_and_text(module, words, schema, expected):
     said = module.help_text(words)
-    names = {field.name for field in dataclasses.fields(schema)} - {"mixture", "weights"}
+    names = {field.name for field in dataclasses.fields(schema)} - {"mixture"}
     for text in (*expected, *names):
         assert text in said
 

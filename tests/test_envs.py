@@ -17,7 +17,8 @@ from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2, GridParams, GridWorld
 from sejax.envs.wrappers import repeat_actions
 from sejax.gym import GYMNASIUM_IDS, RealTask
-from sejax.options import ConfigError, registry
+from sejax.options import ConfigError
+from sejax.options.plain import configure
 from sejax.training import make_trainer
 
 KEY = jax.random.key(0)
@@ -63,7 +64,7 @@ def draw_actions(task, rng, num):
 
 @pytest.mark.parametrize("name", envs.names())
 def test_a_task_is_what_its_configuration_says_of_it(name):
-    task, spec = make(name), envs.spec_of(registry.configure("env", {"name": name}))
+    task, spec = make(name), envs.spec_of(configure("env", {"name": name}))
     for field in dataclasses.fields(envs.TaskSpec):
         assert getattr(task, field.name) == getattr(spec, field.name)
     assert task.name == name and task is envs.make(**task.origin)

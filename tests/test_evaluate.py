@@ -11,7 +11,7 @@ import gymnax
 import jax
 import pandas as pd
 import pytest
-from support import paper_se, paper_training, refusal, refused
+from support import evaluation, paper_se, paper_training, refusal, refused
 
 import sejax
 from sejax import envs
@@ -19,9 +19,8 @@ from sejax.agents.ppo import PPOConfig
 from sejax.evaluate import evaluate, setup_of, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import registry
+from sejax.options.plain import configure
 from sejax.proxies.io import budget_for
-from sejax.runs import config as configuration
 from sejax.runs import plots
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -33,7 +32,7 @@ ROOM = ("num_agents=2", "real_training.max_episodes=2", "devices=1")
 
 
 def evaluate_config(*overrides):
-    return configuration.evaluate_config(overrides)
+    return evaluation(overrides)
 
 
 @functools.cache
@@ -207,7 +206,7 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
                          (theirs, "td3"), ("nope", "ddqn"),
                          ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
         config = evaluate_config(*f"proxy={proxy}".split())
-        assert config.agent == registry.configure("agent", {"name": agent})
+        assert config.agent == configure("agent", {"name": agent})
     # An older file, which lacks that: its task's name is not imported, nor made.
     tensors, header = unpack(theirs.read_bytes(), "sejax")
     header.pop("interface")

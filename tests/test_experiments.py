@@ -23,7 +23,8 @@ from experiments import peers
 from experiments.common import agents, curves, experiment, runs, shards
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
-from sejax.options import ConfigError, Count, registry
+from sejax.options import ConfigError, Count
+from sejax.options.plain import configure
 from sejax.runs import workers
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
@@ -103,9 +104,9 @@ def tiny(monkeypatch):
     """Agents and steps that cost nothing."""
 
     def tiny_agent(kind):
-        known = vars(registry.configure("agent", {"name": kind}))
+        known = vars(configure("agent", {"name": kind}))
         small = {name: value for name, value in TINY_AGENT.items() if name in known}
-        return registry.configure("agent", {"name": kind, **small})
+        return configure("agent", {"name": kind, **small})
 
     monkeypatch.setattr(agents, "agent_config", tiny_agent)
 

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import yaml
 from safetensors.numpy import save
-from support import paper_se, refusal, refused
+from support import evaluation, paper_se, refusal, refused
 
 import sejax
 from sejax.evaluate import setup_of
 from sejax.proxies import header, hub
-from sejax.runs.config import evaluate_config
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
 
@@ -202,6 +201,6 @@ def test_what_cannot_be_read_or_written_is_one_message(the_hub, monkeypatch):
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     sejax.push("cartpole", "me/se")
-    worlds, out_dir = setup_of(evaluate_config(["proxy=hf://me/se@0"]))
+    worlds, out_dir = setup_of(evaluation(["proxy=hf://me/se@0"]))
     assert str(out_dir) == "runs/evaluate-me_se_0"
     assert {world.task.name for world in worlds.values()} == {"cartpole"}

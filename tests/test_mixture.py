@@ -60,7 +60,7 @@ def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
 def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
     bilevel = make_bilevel(task=TASK, agent=mixture(num), es=NESConfig(num_incumbent_evals=asked))
-    assert bilevel.strategy.evaluations.num_incumbent_evals == evals
+    assert bilevel.scoring.evaluations.num_incumbent_evals == evals
 
 
 @pytest.mark.parametrize(("make", "field"), [
@@ -71,7 +71,7 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
     (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
     (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
     (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
-    (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
+    (lambda: MixtureConfig(aggregate="max"), "mixture.aggregate"),
 ])  # fmt: skip
 def test_a_mixture_that_cannot_be_is_refused(make, field):
     assert refused(make) == field

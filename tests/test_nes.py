@@ -19,6 +19,12 @@ DIMS = 6
 MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
 
 
+def num_trainings(strategy):
+    """Trainings in a generation."""
+    evaluations = strategy.evaluations
+    return strategy.population_size * evaluations.num_evals + evaluations.num_incumbent_evals
+
+
 def whole_generations(strategy):
     """`ask` and `tell` of all that a generation tries, the incumbent included, as bilevel.py does.
 
@@ -72,8 +78,7 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     strategy, _, _ = nes(num_evals=2)
     # 3 members, each sign evaluated twice in a row, then one incumbent for each member.
     assert candidates.shape == (3 * 2 + 3 * 2 + 3, DIMS)
-    assert (strategy.num_evaluations, strategy.population_size) == (15, 6)
-    assert strategy.evaluations.num_incumbent_evals == 3
+    assert (strategy.population_size, num_trainings(strategy)) == (6, 15)
     np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
     np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
     assert np.abs(candidates[:6] - MEAN).min() > 0
@@ -146,7 +151,7 @@ def test_generations_equal_a_numpy_loop(update_rule, aggregate_by, mirrored):
     mean = MEAN.astype(np.float64)
     for number in range(3):
         candidates, state = ask(jax.random.key(number), state)
-        scores = rng.normal(size=strategy.num_evaluations)
+        scores = rng.normal(size=num_trainings(strategy))
         scores[-4:] -= 0.5
         state = tell(jax.random.key(0), candidates, jnp.float32(scores), state)
         mean = numpy_generation(
@@ -236,7 +241,7 @@ def climb(strategy, generations):
     Two trainings of each generation diverge, others each time, and in the tenth all do.
     """
     ask, tell = whole_generations(strategy)
-    index = jnp.arange(strategy.num_evaluations)
+    index = jnp.arange(num_trainings(strategy))
 
     def generation(state, scan):
         number, key = scan

@@ -9,6 +9,7 @@ import pytest
 from sejax import envs
 from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
 from sejax.options import registry
+from sejax.options.plain import configure
 
 
 def outcome(test_return, train_steps, nonfinite):
@@ -59,7 +60,7 @@ def test_scores_are_worked_by_hand(config, scores):
 
 OWN = Objective(score=lambda outcome: -outcome.train_episodes.astype(jnp.float32))
 NAMES = registry.names("objective")
-CONFIGS = [registry.configure("objective", {"name": name}) for name in NAMES]
+CONFIGS = [configure("objective", {"name": name}) for name in NAMES]
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,10 @@ from support import refusal
 
 import sejax
 from sejax import options
+from sejax.agents import traced
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import ranges_of
-from sejax.options import Options, option, traced_options
+from sejax.options import Options, option
 
 NAN, INF = float("nan"), float("inf")
 
@@ -78,7 +79,7 @@ def test_a_subclass_that_changes_a_default_keeps_bounds_marks_and_help_text():
     class Mine(QLearningConfig):
         learning_rate: float = 0.5
 
-    assert traced_options(Mine())["learning_rate"] == 0.5
+    assert traced(Mine()).learning_rate == 0.5
     assert "agent.learning_rate=0.5." in str(refusal(Mine, learning_rate=0))
     assert list(ranges_of(Mine())) == ["learning_rate", "discount"]
     assert options.help_texts(Mine) == options.help_texts(QLearningConfig) != {}

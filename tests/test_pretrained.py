@@ -11,16 +11,15 @@ import gymnasium
 import numpy as np
 import pytest
 from plain_agents import agent_for, learn, mean_return
-from support import refused
+from support import evaluation, refused
 
 import sejax
 from sejax import envs
 from sejax.distill import read
 from sejax.evaluate import setup_of
 from sejax.gym import GYMNASIUM_IDS, make
-from sejax.options import registry
+from sejax.options.plain import configure
 from sejax.proxies import header, zoo
-from sejax.runs.config import evaluate_config
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -48,7 +47,7 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
         assert learning.cpu_s > 0 and learning.train_steps > learning.agents
         assert learning.generations >= proxy.generation
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    worlds, _ = setup_of(evaluate_config(words.split()))
+    worlds, _ = setup_of(evaluation(words.split()))
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean)
     assert best.agent in worlds["the proxy"].trainings, "the command trains what did best"
 
@@ -64,7 +63,7 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     else:
         config = sejax.config(words)
         assert config.generations == proxy.learning.generations
-    assert config.env == registry.configure("env", stored.config["env"])
+    assert config.env == configure("env", stored.config["env"])
     agents = stored.learned_agents()
     first = agents[next(iter(agents))].discount  # of a policy there is none
     assert stored.discount == (1.0 if proxy.policy_return is not None else first)

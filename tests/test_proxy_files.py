@@ -19,6 +19,7 @@ import sejax
 from sejax import envs
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
+from sejax.options.plain import to_plain
 from sejax.proxies import header
 from sejax.proxies.reward import RewardConfig
 
@@ -58,8 +59,9 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     proxy = sejax.load_proxy(path.parent)  # a folder with it
     assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
     assert proxy.task is envs.make("gridworld_2x2") and proxy.path == path
-    known = {"env": {"name": "gridworld_2x2"}, "proxy": registry.describe("proxy", env.config)}
-    assert proxy.config == CONFIG | known | {"run_dir": None}  # no path of a machine
+    known = {"env": {"name": "gridworld_2x2"}, "proxy": to_plain(env.config, "proxy")}
+    known |= {"agents": {"q_learning": CONFIG["agent"]}, "preset": "best"}  # today's form
+    assert proxy.config == known | {"run_dir": None}  # no path of a machine
     assert header.read(path).header.config == proxy.config
     assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
 

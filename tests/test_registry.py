@@ -19,6 +19,7 @@ import sejax
 from sejax import envs
 from sejax.agents import AgentConfig
 from sejax.options import registry
+from sejax.options.plain import configure, to_plain
 from sejax.runs import config as configuration
 
 EVERY = [(group, name) for group in registry.GROUPS for name in registry.BUILT_IN[group]]
@@ -27,7 +28,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 def refused(group, name, **fields):
     """The message of what cannot be configured; short, and at fault is the group or a field."""
-    error = refusal(registry.configure, group, {"name": name, **fields})
+    error = refusal(configure, group, {"name": name, **fields})
     assert error.field.partition(".")[0] == group
     return str(error)
 
@@ -51,9 +52,10 @@ def module(tmp_path, monkeypatch, request):
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
-def test_configure_and_describe_are_inverses(group, name):
-    config = registry.configure(group, {"name": name})
-    assert registry.configure(group, registry.describe(group, config)) == config
+def test_a_configuration_is_read_back_from_its_plain_values(group, name, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)  # also without Ray
+    config = configure(group, {"name": name})
+    assert configure(group, to_plain(config, group)) == config
     assert registry.name_of(group, config) == name
     assert type(config) is registry.find(group, name)
 
@@ -181,10 +183,10 @@ def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     module, attribute, values
 ):
     name = f"{module(SEVERAL)}:{attribute}"
-    config = registry.configure("objective", {"name": name, **values})
+    config = configure("objective", {"name": name, **values})
     assert {field: getattr(config, field) for field in values} == values
     assert registry.name_of("objective", config) == name
-    assert registry.configure("objective", registry.describe("objective", config)) == config
+    assert configure("objective", to_plain(config, "objective")) == config
     task = envs.make("cartpole")
     objective = registry.make("objective", config, task)
     assert isinstance(objective, sejax.Objective)
@@ -213,7 +215,7 @@ def test_parameters_are_options_of_the_command_line(module):
 
 
 def test_a_plugin_must_make_what_its_group_is_of(module):
-    config = registry.configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
+    config = configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
     error = refusal(registry.make, "objective", config, envs.make("cartpole"))
     assert error.field == "objective" and "got int from mine_" in str(error)
 
@@ -245,7 +247,7 @@ def test_what_is_no_module_and_attribute_is_not_imported(name):
 @pytest.mark.parametrize("values", [None, "ddqn", {}, {"discount": 0.5}, {"name": 3}, {"name": {}},
                                     {"name": ""}, {"name": "x" * 10_000}])  # fmt: skip
 def test_values_without_a_known_name_are_refused(values):
-    assert field_of(registry.configure, "agent", values) == "agent"
+    assert field_of(configure, "agent", values) == "agent"
 
 
 # --- everything of one's own ---------------------------------------------------------------------

@@ -8,6 +8,7 @@ import sejax
 from experiments.common.reward_networks import OBJECTIVES
 from sejax.bilevel import make_learner
 from sejax.options import registry
+from sejax.options.plain import configure
 from sejax.proxies.reward import VARIANTS
 
 pytestmark = [
@@ -27,7 +28,7 @@ SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_variant_and_objective_learns(task, variant, objective):
-    if variant.endswith("info") and not registry.configure("env", {"name": task}).spec.info_keys:
+    if variant.endswith("info") and not configure("env", {"name": task}).spec.info_keys:
         pytest.skip("refused: the task tells nothing beyond its observation")
     if task == "halfcheetah" and (variant, objective) not in HALFCHEETAH:
         pytest.skip("its agents are large")

@@ -129,5 +129,5 @@ def test_help_says_what_each_field_is():
 
 
 def test_without_optuna_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr("sejax.search.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "pip install 'sejax[search]'" in str(refusal(command.main, []))

@@ -18,6 +18,7 @@ from experiments import se_histograms
 from sejax import evaluate, run, search
 from sejax.ops import checksummed
 from sejax.options import registry
+from sejax.options.plain import to_plain
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.run_directory import COLUMNS
@@ -159,7 +160,7 @@ def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
     env = registry.make("proxy", paper_se(hidden_size=2), task)
-    usual = {**sejax.config().plain(), "proxy": registry.describe("proxy", env.config)}
+    usual = {**sejax.config().plain(), "proxy": to_plain(env.config, "proxy")}
     weights = env.init_weights(jax.random.key(0))
     sejax.save("evil.safetensors", env, weights, config=usual | config)
 

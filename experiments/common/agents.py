@@ -20,8 +20,7 @@ from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents import NoExploration
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import registry
-from sejax.options.plain import to_plain
+from sejax.options.plain import configure, to_plain
 from sejax.training import num_parallel_on_cpu
 
 # Kinds of students, where actions are discrete and where they are continuous.
@@ -76,8 +75,8 @@ class Condition:
         """What the results of all groups depend on, beside seeds and weights."""
         return {
             "task": self.task.origin,
-            "agent": registry.describe("agent", self.agent),
-            "exploration": registry.describe("exploration", self.exploration),
+            "agent": to_plain(self.agent, "agent"),
+            "exploration": to_plain(self.exploration, "exploration"),
             "training": to_plain(self.training),
             "hparams": self.hparams,
             **self.settings,
@@ -286,7 +285,7 @@ SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into,
 
 def agent_config(kind: str) -> Any:
     """The default configuration of a kind of agent."""
-    return registry.configure("agent", {"name": kind})
+    return configure("agent", {"name": kind})
 
 
 def training_as_learned(

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import SimpleNamespace
 from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
@@ -12,7 +12,7 @@ from jaxtyping import Array, Int, PyTree
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.spec import Space
-from sejax.options import Options, WholeNumber, traced_options
+from sejax.options import Options, WholeNumber, marks
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -238,7 +238,9 @@ def traced(config: Options) -> Hparams:
       >>> traced(QLearningConfig()).discount
       0.8
     """
-    return Hparams(**traced_options(config))
+    cls = type(config)
+    names = [field.name for field in fields(cls) if marks(cls, field.name).get("traced")]
+    return Hparams(**{name: getattr(config, name) for name in names})
 
 
 def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:

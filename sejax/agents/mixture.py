@@ -5,18 +5,22 @@ mixture divides the candidates of a generation among several agents. So a step o
 helps all agents, with the same number of trainings.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from pydantic import Field
 
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
 from sejax.options import Options, require, shortened
 from sejax.options.registry import require_part
+
+Weight = Annotated[float, Field(ge=0, le=1e6)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,11 +29,14 @@ class MixtureConfig(Options):
 
     Attributes:
       aggregate: Each agent scores the search mean; the mean of these scores counts, or the worst.
+      weights: share of the candidates that train each agent, 1 if left out; with 0 an agent only
+        judges the search mean
     """
 
-    group: ClassVar[str] = "agents"
+    group: ClassVar[str] = "mixture"
 
     aggregate: Literal["mean", "min"] = "mean"
+    weights: dict[str, Weight] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ from sejax.agents import make_agent
 from sejax.distillation.policy_search import Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import ConfigError, Count, Options, WholeNumber, registry, require, shortened
+from sejax.options.plain import configure
 from sejax.proxies.exact import Layer, evaluate, require_vectors
 from sejax.training import TrainingConfig, make_trainer
 
@@ -125,7 +126,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     """A fresh agent with its default hyperparameters, trained on the real task."""
     with options.errors_of("agent", "policy"):  # it may not fit the task
-        agent = make_agent(registry.configure("agent", {"name": name}), task)
+        agent = make_agent(configure("agent", {"name": name}), task)
     training = TrainingConfig(max_steps=num_steps, max_episodes=num_steps)
     train = make_trainer(agent, task.env, training)
     key_train, key_act = jax.random.split(key)

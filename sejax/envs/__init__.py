@@ -7,6 +7,7 @@ from sejax.envs.base import Task, TaskConfig
 from sejax.envs.spec import Box, Discrete, TaskSpec
 from sejax.envs.wrappers import with_one_done
 from sejax.options import registry
+from sejax.options.plain import configure, to_plain
 
 __all__ = [
     "Box",
@@ -41,14 +42,14 @@ def make(name: str, **options: object) -> Task:
       >>> make("cartpole").solved_reward
       195.0
     """
-    return make_from(registry.configure("env", {"name": name, **options}))
+    return make_from(configure("env", {"name": name, **options}))
 
 
 def make_from(config: TaskConfig) -> Task:
     """The task that a configuration describes, built once; its `origin` is the configuration."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
-        vars(task)["origin"] = registry.describe("env", config)
+        vars(task)["origin"] = to_plain(config, "env")
     return task
 
 

@@ -68,7 +68,7 @@ class Task(TaskSpec):
     def __post_init__(self) -> None:
         params, env, name = self.params, self.env, self.name
         solved_reward = options.as_python(self.solved_reward)
-        is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
+        is_nan = type(solved_reward) in (int, float) and math.isnan(solved_reward)
         is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
         fix = "Set env.solved_reward=inf if it is undefined"
         must = f"must be a number; got {options.shortened(solved_reward)}. {fix}."

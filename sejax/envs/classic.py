@@ -135,11 +135,10 @@ class CartPole(ClassicTask):
     spec = TaskSpec(observation=_CARTPOLE, action=Discrete(2), max_steps=200, solved_reward=195.0)
 
 
-class CartPoleV1(ClassicTask):
+class CartPoleV1(CartPole):
     """`cartpole` with a longer episode. CartPole-v1."""
 
     name = "cartpole_v1"
-    gymnax_id = "CartPole-v1"
     spec = TaskSpec(observation=_CARTPOLE, action=Discrete(2), max_steps=500, solved_reward=475.0)
 
 

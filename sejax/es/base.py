@@ -117,12 +117,6 @@ class Strategy:
     remembers_scores: bool = False
     evaluations: Evaluations = Evaluations()
 
-    @property
-    def num_evaluations(self) -> int:
-        """Trainings in a generation."""
-        evaluations = self.evaluations
-        return self.population_size * evaluations.num_evals + evaluations.num_incumbent_evals
-
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyOptions(Options):

@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
-from sejax.options import ConfigError, Count, checked, registry
+from sejax.options import ConfigError, Count, checked
+from sejax.options.plain import configure
 from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
@@ -146,5 +147,5 @@ def _read(
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
-    config = registry.configure("proxy", header.config["proxy"])
+    config = configure("proxy", header.config["proxy"])
     return header, SyntheticWorld(weights, config, se_task(header, config, task))

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from sejax import envs
 from sejax.gym import networks
 from sejax.gym.tasks import Env, Info, RealTask
-from sejax.options import Fraction, checked, registry, require, shortened
+from sejax.options import Fraction, checked, require, shortened
+from sejax.options.plain import configure
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, read
 from sejax.proxies.reward import RewardConfig
@@ -60,7 +61,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         RecordConstructorArgs.__init__(self, source=str(source), discount=discount)
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
-        self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
+        self.config: RewardConfig = configure("proxy", header.config["proxy"])
         discount = header.discount if discount is None else discount
         self.discount = checked([discount], Fraction, "discount", header.discount)
         weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()

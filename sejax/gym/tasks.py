@@ -13,8 +13,8 @@ from gymnasium.wrappers import TimeLimit
 
 from sejax import envs
 from sejax.envs.spec import Discrete, Space, TaskSpec
-from sejax.options import registry, require, shortened
-from sejax.options.plain import to_plain
+from sejax.options import require, shortened
+from sejax.options.plain import configure, to_plain
 from sejax.proxies.header import Header
 from sejax.proxies.synthetic import SyntheticConfig
 
@@ -103,7 +103,7 @@ def real_env(header: Header, **options: Any) -> Env:
     is_known = name in GYMNASIUM_IDS or name in GRIDS
     # Gymnasium takes more options, such as the path of a model. A file may set only the fields that
     # the task has here.
-    fields = to_plain(registry.configure("env", config)) if is_known else {}
+    fields = to_plain(configure("env", config)) if is_known else {}
     is_known &= fields.pop("backend", "mujoco") != "spring"  # it has other dynamics
     must = "must be given, because Gymnasium does not have the same task"
     fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"

@@ -25,6 +25,7 @@ Example:
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import inspect
 import os
 import re
@@ -36,7 +37,7 @@ from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeGuard
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
@@ -71,8 +72,9 @@ def errors_of(group: str, where: str) -> Iterator[None]:
     except ConfigError as error:
         if group in ("", where):
             raise
-        message = re.sub(rf"\b{group}(?=\.\w| must )", where, str(error))
-        raise ConfigError(message, re.sub(rf"^{group}\b", where, error.field)) from None
+        name = re.escape(group)
+        message = re.sub(rf"\b{name}(?=\.\w| must )", where, str(error))
+        raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
 
 
 def require(holds: object, field: str, message: str) -> None:
@@ -85,6 +87,12 @@ def require(holds: object, field: str, message: str) -> None:
     """
     if not holds:
         raise ConfigError(f"{field} {message}", field)
+
+
+def require_package(field: str, package: str, extra: str) -> None:
+    """Raises `ConfigError` unless a package is installed that comes with an extra of sejax."""
+    message = f"needs the package {package}. Run pip install 'sejax[{extra}]'."
+    require(importlib.util.find_spec(package), field, message)
 
 
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
@@ -174,7 +182,7 @@ def option(
     Args:
       default: its default.
       traced: whether it is a number that the compiled program takes as an argument, so that a
-        population may vary it without compiling anew. See `traced_options`.
+        population may vary it without compiling anew. See `sejax.agents.traced`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
       names_code: whether its text may be a `module:attribute`, which the user must type.
     """
@@ -274,12 +282,6 @@ def require_known(field: str, value: object, known: Collection[str]) -> None:
         raise unknown_name(field, str(value), known)
 
 
-def traced_options(config: Options) -> dict[str, Any]:
-    """Values of the fields that are traced, in the order of the dataclass."""
-    names = [field.name for field in dataclasses.fields(config)]
-    return {x: getattr(config, x) for x in names if marks(type(config), x).get("traced")}
-
-
 def marks(cls: type, name: str) -> dict[str, Any]:
     """The metadata of a field; a subclass inherits the marks that it does not set.
 
@@ -303,7 +305,8 @@ def field_lines(
     texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
     lines = []
     for name, value in values.items():
-        about = f"  # {texts[name]}" if name in texts else ""
+        text = texts.get(name, texts.get(".".join(name.split(".")[:2])))  # a key's is its field's
+        about = f"  # {text}" if text else ""
         line = f"  {name}={as_text(value)}{about}{sources.get(name, '')}"
         lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
     return "\n".join(lines)
@@ -318,11 +321,6 @@ def help_texts(cls: type) -> dict[str, str]:
         entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
     return texts
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is an int or a float; a bool does not count. See `as_python`."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def as_python(value: Any) -> Any:

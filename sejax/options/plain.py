@@ -1,11 +1,13 @@
 """Dataclasses to plain values, as files and overrides hold them, and back.
 
 `to_plain` writes a configuration as plain values: numbers, texts, None, lists, dictionaries.
-`from_plain` reads it back. Pydantic converts each value to its field's type: `1` to a float, a list
-to a tuple, the text of an override to a number. Nothing is imported or executed.
+`from_plain` and, for a plugin, `configure` read it back. Pydantic converts each value to its
+field's type: `1` to a float, a list to a tuple, the text of an override to a number. Only a
+`module:attribute` that the caller allows is imported.
 """
 
 import dataclasses
+import functools
 import os
 import re
 import typing
@@ -21,6 +23,7 @@ from sejax.options import (
     listed,
     marks,
     nearest,
+    registry,
     require,
     shortened,
 )
@@ -40,18 +43,67 @@ _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False":
 # --- dataclasses ---------------------------------------------------------------------------------
 
 
-def to_plain(value: object) -> Any:
-    """A value as plain values; a dataclass as a dictionary of its fields."""
+def to_plain(value: object, group: str | None = None) -> Any:
+    """A value as plain values; a dataclass as a dictionary of its fields.
+
+    Args:
+      value: any value.
+      group: of a plugin's configuration, whose name is then written too. Fields that hold plugins
+        have their groups.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in dataclasses.fields(value) if field.init]
-        return {name: to_plain(getattr(value, name)) for name in names}
+        fields = [field.name for field in dataclasses.fields(value) if field.init]
+        groups = {field: marks(type(value), field).get("plugin") for field in fields}
+        name = {"name": registry.name_of(group, value)} if group else {}
+        return name | {field: to_plain(getattr(value, field), groups[field]) for field in fields}
     if isinstance(value, tuple | list):
-        return [to_plain(x) for x in value]
+        return [to_plain(x, group) for x in value]
     if isinstance(value, Mapping):
-        return {str(key): to_plain(x) for key, x in value.items()}
+        return {str(key): to_plain(x, group) for key, x in value.items()}
     if hasattr(value, "tolist") and not isinstance(value, type):  # arrays of NumPy and jax
         return value.tolist()
     return value
+
+
+def plugin(group: str) -> Any:
+    """A dataclass field with a plugin's configuration; the default is sejax's own first one."""
+    first = {"name": next(iter(registry.BUILT_IN[group]))}
+    factory = functools.partial(configure, group, first)
+    return dataclasses.field(default_factory=factory, metadata={"plugin": group})
+
+
+def plugins(group: str) -> Any:
+    """A dataclass field with the configurations of several plugins by keys."""
+    return dataclasses.field(default_factory=dict, metadata={"plugin": group})
+
+
+def configure(group: str, values: Any, imports: Collection[str] | None = None) -> Any:
+    """The configuration of a plugin that plain values describe: its `name`, and its fields.
+
+    Args:
+      group: one of `sejax.options.registry.GROUPS`.
+      values: plain values by field name.
+      imports: each `module:attribute` that may be imported; None: any.
+
+    Raises:
+      ConfigError: for an unknown name or field, or a bad value.
+
+    Example:
+      >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
+      0.9
+    """
+    is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
+    message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
+    require(is_choice, group, message)
+    cls = registry.find(group, values["name"], imports)
+    known = fields_of(cls)
+    fields = {k: v for k, v in values.items() if k != "name" or k in known}
+    for field in [name for name in fields if name not in known]:
+        built_in = registry.BUILT_IN[group]
+        others = [x for x in built_in if field in fields_of(registry.find(group, x))]
+        message = f"is a field of {group}={', '.join(others)}. Set one of them."
+        require(not others, f"{group}.{field}", message)
+    return from_plain(cls, fields, group, imports)
 
 
 def from_plain(
@@ -75,25 +127,16 @@ def from_plain(
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        if isinstance(value, str) and ":" in value and marks(cls, name).get("names_code"):
-            require_typed(full[name], str(value), imports)
-        fields[name] = _read(value, hints[name], full[name], defaults[name], imports)
+        of_field = marks(cls, name)
+        if isinstance(value, str) and ":" in value and of_field.get("names_code"):
+            registry.require_typed(full[name], str(value), imports)
+        how = defaults[name], imports, of_field.get("plugin")
+        fields[name] = _read(value, hints[name], full[name], *how)
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
         require(is_known, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
     with errors_of(getattr(cls, "group", where), where):
         return cls(**fields)
-
-
-def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
-    """Checks that `module:attribute` may be imported; imports nothing.
-
-    Raises:
-      ConfigError: if it is not one of `imports`.
-    """
-    got = shortened(path, 60)
-    message = f"must be typed, as names in files are never imported; got {got}. Set {field}={got}"
-    require(imports is None or path in imports, field, f"{message}, if you trust it.")
 
 
 def fields_of(cls: type) -> dict[str, Any]:
@@ -115,8 +158,25 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
 
 
-def _read(value: Any, hint: Any, name: str, default: Any, imports: Collection[str] | None) -> Any:
-    """A value as its field's type; see `sejax.options.checked`."""
+def _read(
+    value: Any,
+    hint: Any,
+    name: str,
+    default: Any,
+    imports: Collection[str] | None,
+    group: str | None,
+) -> Any:
+    """A value as its field's type; see `sejax.options.checked`. A dictionary's keys are sorted."""
+    of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
+    if isinstance(value, Mapping) and of_key is not Any:
+        how = MISSING, imports, group
+        names = {key: f"{name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
+        return {str(key): _read(value[key], of_key, names[key], *how) for key in names}
+    if group:
+        if isinstance(value, Mapping) and default is not MISSING:
+            value = {"name": registry.name_of(group, default), **value}
+        with errors_of(group, name):
+            return configure(group, value, imports)
     is_dataclass = isinstance(hint, type) and dataclasses.is_dataclass(hint)
     if is_dataclass and not isinstance(value, hint):
         fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"

@@ -21,8 +21,7 @@ A name comes with sejax, is an entry point of an installed package, or is `modul
 imports the module. Code that reads a file says which `module:attribute` may be imported
 (`imports`): those that the user has typed, or none.
 
-`describe` writes a configuration as plain values, and `configure` reads it back;
-`sejax.options.plain` says what a value may be.
+`sejax.options.plain` makes configurations of plain values, and writes them.
 """
 
 import copy
@@ -31,12 +30,11 @@ import functools
 import importlib.metadata
 import inspect
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_checkable
 
 from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
-from sejax.options.plain import fields_of, from_plain, require_typed, to_plain
 
 PASS_AN_OBJECT = "Pass an object; sejax.config([...]) takes names."
 T = TypeVar("T")
@@ -200,7 +198,7 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
     return plugin
 
 
-def name_of(group: str, config: Makes[Any]) -> str:
+def name_of(group: str, config: object) -> str:
     """The name by which `find` finds a configuration's class again."""
     cls = type(config)
     if "name" in getattr(cls, "__dataclass_fields__", ()):  # the class serves several names
@@ -208,6 +206,11 @@ def name_of(group: str, config: Makes[Any]) -> str:
     path = f"{cls.__module__}:{cls.__qualname__}"
     built_in = {path: name for name, path in BUILT_IN[group].items()}
     return _NAMES.get(cls) or built_in.get(path, path)
+
+
+def key_of(name: str) -> str:
+    """The key of an agent's name: `my_module_MyAgent` for `my_module:MyAgent`."""
+    return re.sub(r"[^\w-]+", "_", name)
 
 
 _NAMES: dict[type, str] = {}  # names of classes that were found by a name other than their path
@@ -226,40 +229,7 @@ def _path_of(group: str, name: str) -> str | None:
     return _paths(group).get(name, by_prefix)
 
 
-# --- configurations ------------------------------------------------------------------------------
-
-
-def configure(group: str, values: Mapping[str, Any], imports: Collection[str] | None = None) -> Any:
-    """The configuration that plain values describe: the field `name`, and the plugin's fields.
-
-    Args:
-      group: one of `GROUPS`.
-      values: plain values by field name.
-      imports: each `module:attribute` that may be imported; None: any.
-
-    Raises:
-      ConfigError: for an unknown name or field, or a bad value.
-
-    Example:
-      >>> configure("agent", {"name": "q_learning", "discount": 0.9}).discount
-      0.9
-    """
-    is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
-    message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
-    require(is_choice, group, message)
-    cls = find(group, values["name"], imports)
-    known = fields_of(cls)
-    fields = {k: v for k, v in values.items() if k != "name" or k in known}
-    for field in [name for name in fields if name not in known]:
-        others = [x for x in BUILT_IN[group] if field in fields_of(find(group, x))]
-        message = f"is a field of {group}={', '.join(others)}. Set one of them."
-        require(not others, f"{group}.{field}", message)
-    return from_plain(cls, fields, group, imports)
-
-
-def describe(group: str, config: Makes[Any]) -> dict[str, Any]:
-    """Inverse of `configure`."""
-    return {"name": name_of(group, config), **to_plain(config)}
+# --- objects -------------------------------------------------------------------------------------
 
 
 @overload
@@ -317,6 +287,17 @@ def require_part(group: str, cls: type[T], part: object, fix: str = PASS_AN_OBJE
 
 
 # --- plugins -------------------------------------------------------------------------------------
+
+
+def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
+    """Checks that `module:attribute` may be imported; imports nothing.
+
+    Raises:
+      ConfigError: if it is not one of `imports`.
+    """
+    got = shortened(path, 60)
+    message = f"must be typed, as names in files are never imported; got {got}. Set {field}={got}"
+    require(imports is None or path in imports, field, f"{message}, if you trust it.")
 
 
 def require_path(field: str, path: str) -> None:

@@ -19,13 +19,12 @@ from sejax.ops import checksummed
 from sejax.options import (
     LARGEST,
     ConfigError,
-    is_number,
     registry,
     require,
     require_known,
     shortened,
 )
-from sejax.options.plain import expanded, from_plain
+from sejax.options.plain import configure, expanded, from_plain, merge
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -36,7 +35,7 @@ PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
 KIND = "sejax"  # name of the metadata's entry
 # Fields that older files lack, with the defaults of that time.
-OLD_DEFAULTS = {"training": {"time_limit_is_terminal": True}}
+OLD_TRAINING = {"time_limit_is_terminal": True}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +46,8 @@ class Header:
       format_version: version of the format; this module reads only one.
       task: name of the real task.
       interface: the task's spaces and step limit, see `sejax.Task.interface`.
-      config: configuration that the proxies were learned with; at least `env` and `proxy`.
+      config: configuration that the proxies were learned with, `upgraded`; at least `env` and
+        `proxy`.
       discount: gamma of the agent that they were learned with, in [0, 1].
       is_set: whether the tensors have a leading axis over several proxies.
       proxies: a record of each proxy, such as its score, generation and seed.
@@ -65,7 +65,12 @@ class Header:
     proxies: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        parts = [self.config["env"], self.config["proxy"], *self.proxies]
+        config = upgraded(self.config)
+        if isinstance(training := config.get("training"), Mapping):
+            config["training"] = {**OLD_TRAINING, **training}
+        object.__setattr__(self, "config", config)
+        agents = dict(config["agents"]).values()
+        parts = [config["env"], config["proxy"], *agents, *self.proxies]
         is_whole = self.proxies and all(isinstance(part, Mapping) for part in parts)
         if self.format_version != FORMAT_VERSION or not is_whole:
             raise ValueError(f"format {self.format_version}, or a part that is missing")
@@ -73,7 +78,7 @@ class Header:
         for record in self.proxies:
             numbers += [record[name] for name in ("score", "generation", "seed") if name in record]
             numbers += dict(record.get("scores", {})).values()
-        are_numbers = all(map(is_number, numbers)) and 0 <= self.discount <= 1
+        are_numbers = {*map(type, numbers)} <= {int, float} and 0 <= self.discount <= 1
         np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
         sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
@@ -116,15 +121,23 @@ def _sizes_of(space: Space) -> list[int]:
     return [space.size * are_bounds]
 
 
-def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values of a configuration's agent, or of its mixture of agents, by their keys."""
-    agent, mixture = config.get("agent"), config.get("agents")
-    agents: dict[str, Any] = {
-        key: {name: value for name, value in values.items() if name != "weight"}
-        for key, values in (mixture.items() if isinstance(mixture, Mapping) else ())
-        if isinstance(values, Mapping)
-    }
-    return agents or {str(agent.get("name")) if isinstance(agent, Mapping) else "": agent}
+def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration of a file, in the form in which files are written today.
+
+    Older versions wrote an only agent as `agent`, and the settings of a mixture among its agents.
+    """
+    none = [name for name in ("agent", "agents") if config.get(name) is None]
+    new = {name: x for name, x in config.items() if name not in none}
+    if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
+        new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
+    if isinstance(agents := new.setdefault("agents", {}), Mapping):
+        of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
+        by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
+        weights = {key: x.pop("weight") for key, x in by_key.items() if "weight" in x}
+        if of_all or weights:
+            new["mixture"] = merge(new.get("mixture", {}), of_all, {"weights": weights})
+        new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
+    return new
 
 
 def is_registered(group: str, stored: object) -> bool:
@@ -144,7 +157,7 @@ def configured(group: str, values: object, where: str) -> Any:
       ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
-        return registry.configure(group, values)  # type: ignore[arg-type]
+        return configure(group, values)  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field = PLUGIN_ARGUMENTS.get(group, group)
     word = PLUGIN_WORDS.get(group, group)

@@ -8,7 +8,7 @@ network.
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 from sejax.options import ConfigError, require, shortened, told
@@ -65,7 +65,7 @@ def fetch(address: str, option: str = "source") -> Path:
         cannot be reached; or if `huggingface_hub` is not installed.
     """
     repo, revision, file = parse(address, option)
-    with _explained(option, address):
+    with explained(option, address):
         from huggingface_hub import hf_hub_download
 
         size = hf_hub_download(repo, file, revision=revision, dry_run=True).file_size
@@ -74,28 +74,8 @@ def fetch(address: str, option: str = "source") -> Path:
         return Path(hf_hub_download(repo, file, revision=revision))
 
 
-def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -> None:
-    """Writes files to a repository in one commit, and makes the repository if it is not there.
-
-    Args:
-      repo: `USER/REPO`.
-      files: contents by name.
-      message: of the commit.
-      private: whether a new repository is private.
-
-    Raises:
-      ConfigError: if it cannot be written, or `huggingface_hub` is not installed.
-    """
-    with _explained("repo", repo):
-        from huggingface_hub import CommitOperationAdd, HfApi
-
-        HfApi().create_repo(repo, private=private, exist_ok=True)
-        additions = [CommitOperationAdd(name, content) for name, content in files.items()]
-        HfApi().create_commit(repo, additions, commit_message=message)
-
-
 @contextlib.contextmanager
-def _explained(option: str, address: str) -> Iterator[None]:
+def explained(option: str, address: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
     try:
         yield

@@ -23,10 +23,10 @@ from sejax.envs.spec import TaskSpec
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, require_known, shortened, told
-from sejax.options.plain import from_plain
+from sejax.options.plain import configure, from_plain, to_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
-from sejax.proxies.header import Header, Stored, agents_of, check_tensors
+from sejax.proxies.header import Header, Stored, check_tensors
 from sejax.training import TrainingConfig
 
 
@@ -64,9 +64,9 @@ class _Loaded:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        agents = [*agents_of(self.config).values()]
-        agent = agents[0] if len(agents) == 1 else None
-        values = agent if group == "agent" else self.config.get(group)
+        agents = self.config["agents"].values()
+        of_agent = next(iter(agents)) if len(agents) == 1 else None
+        values = of_agent if group == "agent" else self.config.get(group)
         return header.configured(group, values, self.path.name)
 
     def learned_agents(self) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class _Loaded:
           >>> list(load_proxy("cliff_walking-rn").learned_agents())
           ['q_learning']
         """
-        stored, where = agents_of(self.config).items(), self.path.name
+        stored, where = self.config["agents"].items(), self.path.name
         return {key: header.configured("agent", values, where) for key, values in stored}
 
 
@@ -193,7 +193,7 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
       0
     """
     env, config = _stored_env(proxy)
-    stored = agents_of(config)
+    stored = config["agents"] or {"": None}
     name = next(iter(stored)) if name is None else name
     require_known("name", name, stored)
     agent = header.configured("agent", stored[name], env.name)
@@ -224,12 +224,12 @@ def training_of(
     must = f"must be given for {shortened(env.name)}, whose file does not tell it"
     fix = "Set training=sejax.TrainingConfig(...)"
     require(isinstance(stored, Mapping), "training", f"{must}; got none. {fix}.")
-    training = from_plain(TrainingConfig, header.OLD_DEFAULTS["training"] | stored, "training")
+    training = from_plain(TrainingConfig, stored, "training")
     if agent is None:
         return training
-    agents = agents_of(config).values()
+    agents = config["agents"].values()
     known = [values for values in agents if header.is_registered("agent", values)]
-    learned_with = [registry.configure("agent", values) for values in known]
+    learned_with = [configure("agent", values) for values in known]
     return budget_for(training, agent, learned_with, env.max_steps, env.task.max_steps)
 
 
@@ -328,7 +328,7 @@ def save_set(
     if not is_set:
         tensors = {name: x[0] for name, x in tensors.items()}
     known = {"env": env.task.origin or {"name": env.task.name}}
-    known["proxy"] = registry.describe("proxy", env.config)
+    known["proxy"] = to_plain(env.config, "proxy")
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,

@@ -132,7 +132,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     record, config = learned.proxies[0], learned.config
     values = {x: record[x] for x in fields_of(PretrainedProxy) if record.get(x) is not None}
     if "score" in record:
-        scores = dict.fromkeys(header.agents_of(config), float(record["score"]))
+        scores = dict.fromkeys(config["agents"], float(record["score"]))
         values.setdefault("scores", scores)
     objective = config.get("objective")
     values |= {
@@ -230,6 +230,11 @@ def push(
     config, address = stored.header.config, f"{hub.SCHEME}{repo}"
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
-    files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
-    hub.upload(repo, files, "A proxy of sejax", private)
+    with hub.explained("repo", repo):
+        from huggingface_hub import CommitOperationAdd, HfApi
+
+        HfApi().create_repo(repo, private=private, exist_ok=True)
+        files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
+        additions = [CommitOperationAdd(name, content) for name, content in files.items()]
+        HfApi().create_commit(repo, additions, commit_message="A proxy of sejax")
     return address

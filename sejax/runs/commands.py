@@ -70,9 +70,9 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 def _devices(overrides: Sequence[str]) -> int | None:
     """The value of `devices=`, if it is a number; 1 if other machines compute the trainings."""
     with contextlib.suppress(ConfigError):  # the command raises it later
-        values = compose.read(compose.expand(overrides)[0])
-        is_here = values.get("machines", "local") == "local"
-        count = str(values.get("devices", "")) if is_here else "1"
+        tree = compose.read(compose.expand(overrides)[0], ["machines"])
+        is_here = tree.get("machines", {}).get("name", "local") == "local"
+        count = str(tree.get("devices", "")) if is_here else "1"
         return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None
     return None
 

@@ -4,6 +4,7 @@ import time
 
 from sejax.bilevel import Bilevel
 from sejax.options import registry
+from sejax.options.plain import to_plain
 from sejax.runs import compose
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
@@ -64,7 +65,7 @@ class RunProgress:
             verdict += f": {bilevel.scoring.objective.meaning}"
         # The user must type the names of plugins: no name in a file is imported.
         agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
-        env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
+        env, proxy = to_plain(self._config.env, "env"), self._config.name("proxy")
         named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
         words = "".join(f" {name}={text}" for name, text in named.items() if ":" in text)
         fields = ", ".join(f"{name}={value!r}" for name, value in env.items())

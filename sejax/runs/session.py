@@ -80,13 +80,12 @@ def run(
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
     ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
-    generations, agents = len(directory.rows), bilevel.strategy.num_evaluations
+    generations, agents = len(directory.rows), sum(bilevel.evaluate.sizes)
     summary_file = directory.path / "run.json"
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # none, or damaged
         stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
         if (stored["generations"], stored["ended"]) == (generations, ended):
             return stored  # which names the machine that computed it
-    steps = sum(float(row["train_steps_mean"]) for row in directory.rows)
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
         "ended": ended,
@@ -96,7 +95,7 @@ def run(
         "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
         "generations": generations,
         "agents": generations * agents,
-        "train_steps": round(steps * agents),
+        "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
         "real_steps": int(directory.last("env_steps_total")),
         "devices": [str(device) for device in jax.devices()],
         "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
@@ -140,7 +139,7 @@ def _advance(
 
 def _all_diverged(directory: RunDirectory, bilevel: Bilevel) -> bool:
     """Whether every agent of every generation has diverged; False before the first generation."""
-    rows, agents = directory.rows, bilevel.strategy.num_evaluations
+    rows, agents = directory.rows, sum(bilevel.evaluate.sizes)
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import yaml
 
-from sejax.options import registry, told
+from sejax.options import registry, require_package, told
 from sejax.options.registry import Makes
 
 
@@ -107,7 +107,8 @@ class NoTracker:
 class TensorBoardConfig:
     """Event files in `tensorboard/` of the run directory, by tensorboardX, which needs no torch."""
 
-    package: ClassVar[str] = "tensorboardX"
+    def __post_init__(self) -> None:
+        require_package("tracker", "tensorboardX", "tensorboard")
 
     def make(self, run: TrackedRun) -> Tracker:
         from tensorboardX import SummaryWriter

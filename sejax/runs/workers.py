@@ -29,7 +29,7 @@ from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import ConfigError, Count, FailedError, Options, shortened, told
+from sejax.options import ConfigError, Count, FailedError, Options, require_package, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
@@ -116,10 +116,13 @@ class RayConfig(Options):
 
     group: ClassVar[str] = "machines"
     is_elsewhere: ClassVar[bool] = True
-    package: ClassVar[str] = "ray"
 
     address: str | None = None
     workers: Count | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_package("machines", "ray", "ray")
 
     @contextlib.contextmanager
     def make(self, config: LearnConfig) -> Iterator["RemoteChunks"]:

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require, shortened
-from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
+from sejax.options.plain import from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import LearnConfig, layers_of
 from sejax.searching import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
@@ -123,29 +123,26 @@ def read(overrides: Sequence[str]) -> StudyPlan:
     Raises:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
-    values, fixed, space = {}, [], {}
-    for override in overrides:
-        name, _, text = override.partition("=")
-        if name in fields_of(StudyConfig):
-            values[name] = text
-        elif spaces.is_range(text):
-            space[name] = spaces.parse(name, text)
-        else:
-            fixed.append(override)
+    pairs = (override.partition("=") for override in overrides)
+    ranges = {name: text for name, _, text in pairs if spaces.is_range(text)}
+    rest = [override for override in overrides if override.partition("=")[0] not in ranges]
+    own, others = compose.partition(rest, StudyConfig)
+    for name, text in (ranges | others).items():
         must = f"must be left out, as the search sets it; got {shortened(text)}"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
         require(name.partition(".")[0] not in TAKEN, name, f"{must}. {fix}")
-    config, others = from_plain(StudyConfig, values, ""), compose.read(fixed)
-    search = StudyPlan(config=config, fixed=tuple(fixed), space=space)
-    default, fields = search.default, configuration.words_of(search.default)
-    if config.space is not None:
-        agents = {
-            compose.field_of(k, default.agents): registry.name_of("agent", x)
-            for k, x in default.agents.items()
-        }
-        for name, dimension in spaces.preset(config.space, agents).items():
-            if name not in others:
+    space = {name: spaces.parse(name, text) for name, text in ranges.items()}
+    fixed = tuple(f"{name}={text}" for name, text in others.items())
+    search = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
+    default, preset = search.default, search.config.space
+    if preset is not None:
+        by_key = default.agents.items()
+        agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
+        typed = default.words(layers_of(LearnConfig, fixed)["typed"])
+        for name, dimension in spaces.preset(preset, agents).items():
+            if name not in typed:
                 space.setdefault(name, dimension)
+    fields = default.words(default.plain())
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
     must = "must be given and have ranges for these agents, or fields must have some; got none"

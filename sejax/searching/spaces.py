@@ -23,7 +23,7 @@ from typing import Any
 import yaml
 from optuna import distributions
 
-from sejax.options import ConfigError, as_text, is_number, nearest, require, shortened, told
+from sejax.options import ConfigError, as_text, nearest, require, shortened, told
 from sejax.options.plain import split
 from sejax.runs.compose import UNREADABLE
 
@@ -66,7 +66,7 @@ class Dimension:
         try:
             if isinstance(self.distribution, distributions.CategoricalDistribution):
                 value = as_text(value)
-            elif self.is_inverse and is_number(value):
+            elif self.is_inverse and isinstance(value, int | float):
                 value = round(1 - value, 12)
             is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
         except (TypeError, ValueError):

@@ -23,9 +23,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sejax.ops.files import require_writable, write_text
 from sejax.options import ConfigError, told
 from sejax.options.plain import parsed
-from sejax.runs import compose, session, workers
-from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig
+from sejax.runs import session, workers
+from sejax.runs.config import LearnConfig, layers_of
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
@@ -62,7 +61,7 @@ def open_study(search: StudyPlan) -> optuna.Study:
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
-            fields = configuration.words_of(search.default)
+            fields = search.default.words(search.default.plain())
             first = {x.parameter: x.parameter_of(fields[name]) for name, x in search.space.items()}
             if None not in first.values():
                 study.enqueue_trial(first, skip_if_exists=True)
@@ -277,7 +276,8 @@ def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     """Writes settings as a command and as a preset; returns the command."""
     words = [*search.fixed, *overrides]
     line = shlex.join(["python", "-m", "sejax.run", *words])
-    settings = {k: parsed(x) if isinstance(x, str) else x for k, x in compose.read(words).items()}
+    read = search.default.words(layers_of(LearnConfig, words)["typed"])
+    settings = {k: parsed(x) if isinstance(x, str) else x for k, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
     write_text(search.folder / "best.txt", f"{line}\n")
     write_text(search.folder / "preset.yaml", f"# {line}\n{text}")
