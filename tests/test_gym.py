@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from support import paper_se, printed, random_like, refused, shapes_of
+from support import forge, paper_se, printed, random_like, refused, shapes_of
 
 import sejax.gym
 from sejax import envs
@@ -465,7 +465,8 @@ def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(
 
 def test_a_file_that_is_no_single_se_is_refused(tmp_path):
     env, path = jax_se(), tmp_path / "other.safetensors"
-    sejax.save(path, env, random_weights(env), config={"proxy": {"name": "mine:LinearSE"}})
+    sejax.save(path, env, random_weights(env))
+    forge(path, proxy={"name": "mine:LinearSE"})
     assert refused(make, path) == "source"
     sejax.save_set(path, env, [random_weights(env)] * 2, [{}, {}])
     assert refused(make, path) == "source"

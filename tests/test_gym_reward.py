@@ -5,7 +5,7 @@ import jax
 import numpy as np
 import pytest
 from gymnasium import wrappers
-from support import numpy_forward, random_like, refused, shapes_of
+from support import forge, numpy_forward, random_like, refused, shapes_of
 
 import sejax
 from sejax import envs
@@ -274,6 +274,7 @@ def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
         rn = registry.make("proxy", RewardConfig(hidden_size=2), env)
         path = tmp_path / "rn.safetensors"
         weights = random_like(shapes_of(rn.init_weights, KEY))
-        sejax.save(path, rn, weights, config={"env": task}, discount=0.9)
+        sejax.save(path, rn, weights, discount=0.9)
+        forge(path, env=task)
         assert refused(make, path) == "task"
         assert make(path, "Pendulum-v1").reset(seed=0)[0].shape == (3,)

@@ -59,6 +59,9 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     proxy = sejax.load_proxy(path.parent)  # a folder with it
     assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
     assert proxy.task is envs.make("gridworld_2x2") and proxy.path == path
+    other = CONFIG | {"env": {"name": "cartpole"}}  # the environment's own task counts
+    sejax.save(path, env, weights[0], other, 0.7)
+    assert sejax.load_proxy(path).config["env"] == {"name": "gridworld_2x2"}
     known = {"env": {"name": "gridworld_2x2"}, "proxy": to_plain(env.config, "proxy")}
     known |= {"agents": {"q_learning": CONFIG["agent"]}, "preset": "best"}  # today's form
     assert proxy.config == known | {"run_dir": None}  # no path of a machine

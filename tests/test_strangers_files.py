@@ -6,19 +6,19 @@ imported, or a function of Python's own that runs a shell command.
 
 import functools
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import yaml
-from support import ended, paper_se, refusal
+from support import ended, forge, paper_se, refusal
 
 import sejax
 from experiments import se_histograms
 from sejax import evaluate, run, search
 from sejax.ops import checksummed
 from sejax.options import registry
-from sejax.options.plain import to_plain
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.run_directory import COLUMNS
@@ -160,9 +160,9 @@ def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
     env = registry.make("proxy", paper_se(hidden_size=2), task)
-    usual = {**sejax.config().plain(), "proxy": to_plain(env.config, "proxy")}
-    weights = env.init_weights(jax.random.key(0))
-    sejax.save("evil.safetensors", env, weights, config=usual | config)
+    weights, usual = env.init_weights(jax.random.key(0)), sejax.config().plain()
+    sejax.save("evil.safetensors", env, weights, config=usual)
+    forge(Path("evil.safetensors"), **config)
 
 
 @pytest.mark.parametrize("foreign", PROXIES, ids=range(len(PROXIES)))

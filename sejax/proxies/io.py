@@ -280,8 +280,8 @@ def save(
       path: the file, `*.safetensors`.
       env: the proxy.
       weights: in the form of its `init_weights`; kept as float32.
-      config: configuration that it was learned with, nested plain values; task and kind of proxy
-        are added.
+      config: configuration that it was learned with, nested plain values. Those of the task and
+        the proxy are taken from `env`.
       discount: gamma of the agent that it was learned with, which a potential-based RN needs; 1 if
         it is not given.
       **record: plain values to keep with it, such as `score`, `generation` and `seed`.
@@ -327,15 +327,14 @@ def save_set(
     _require_weights("weights", tensors, env, len(records), "params.weights")
     if not is_set:
         tensors = {name: x[0] for name, x in tensors.items()}
-    known = {"env": env.task.origin or {"name": env.task.name}}
-    known["proxy"] = to_plain(env.config, "proxy")
+    known = {"proxy": to_plain(env.config, "proxy"), "run_dir": None}  # no path of this machine
+    known |= {"env": env.task.origin} if env.task.origin else {}
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            # Without the folder, which is a path on the machine of the run.
-            config={**known, **(config or {}), "run_dir": None},
+            config={"env": {"name": env.task.name}, **(config or {}), **known},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
