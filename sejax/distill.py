@@ -17,7 +17,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import pandas as pd
@@ -63,8 +63,6 @@ class DistillConfig(Options):
       num_students: Students of each agent on each SE; their returns choose one of the SEs.
       num_tested: Further students of each agent, on the chosen SE.
     """
-
-    group: ClassVar[str] = ""
 
     policy: str | None = None
     copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)

@@ -96,38 +96,40 @@ class EvaluateConfig(CommandConfig):
         require(self.training_from == "config" or not changed, "training", message)
 
     @classmethod
-    def layers_below(cls, words: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
         """What agents take from the run that learned the proxy.
 
         If no word names an agent, all of the proxy's agents train, with their exploration and the
-        run's `time_limit_is_terminal`. A typed agent that the proxy was learned with has the
-        proxy's hyperparameters. If the file has no agents, the task's default one trains.
+        run's `time_limit_is_terminal`; typed fields lie over theirs. A typed agent that the proxy
+        was learned with has the proxy's hyperparameters. If the file has no agents, the task's
+        default one trains.
 
         Raises:
-          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words set agents or
-            exploration, or if the file does not tell its agents.
+          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words name agents, or
+            if the file does not tell its agents.
         """
         fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-        require("proxy" in words, "proxy", f"must be given. {fix}")
-        hparams = words.get("agent_hparams")
-        typed = [name for name in ("agents", "agent", "exploration") if words.get(name)]
-        must = f"must be left out with agent_hparams={hparams}; got {', '.join(typed)}"
-        is_typed = bool(typed) and hparams == "as_learned" and words["proxy"] != "real"
-        require(not is_typed, (typed or [""])[0], f"{must}. Set agent_hparams=default.")
+        require("proxy" in typed, "proxy", f"must be given. {fix}")
+        names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
+        is_clear = not names or hparams != "as_learned" or typed["proxy"] == "real"
+        must = f"must be left out with agent_hparams=as_learned; got {', '.join(names)}"
+        require(is_clear, "agents", f"{must}. Set agent_hparams=default.")
         stored, learned, default = None, Tree(), ""
         try:
-            if words["proxy"] != "real":
-                stored = header.read(str(words["proxy"]), "proxy").header
+            if typed["proxy"] != "real":
+                stored = header.read(str(typed["proxy"]), "proxy").header
                 default, learned = agents.default_for(stored.spec), learned_with(stored.config)
         except ConfigError:  # loading the proxy raises it later
             if hparams == "as_learned":
                 raise
         must = "must be left out for a proxy whose file tells no agents that sejax knows"
         require(learned or not stored or hparams != "as_learned", "agent_hparams", f"{must}.")
-        if learned and not typed and hparams in (None, "as_learned"):
+        if learned and not names and hparams in (None, "as_learned"):
+            if "name" in typed.get("exploration", {}):
+                del learned["exploration"]
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
-        default = default or default_agent({"name": words.get("env", "cartpole")}, imports)
-        names = compose.names_of(words["agents"]) or {default: default}
+        default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)
+        names = names or {default: default}
         of_agents = learned.get("agents", {}).values() if hparams is None else ()
         by_name = {agent["name"]: agent for agent in of_agents}
         of_names = {key: by_name.get(name, {"name": name}) for key, name in names.items()}
@@ -141,8 +143,8 @@ def learned_with(config: Mapping[str, Any]) -> Tree:
     if not are_known or not all([*are_known, header.is_registered("exploration", explored)]):
         return {}
     limit = flatten(config).get("training.time_limit_is_terminal", True)
-    limits = {"time_limit_is_terminal": limit}
-    return {"agents": config["agents"], "exploration": explored, "real_training": limits}
+    real_training = {"time_limit_is_terminal": limit}
+    return {"agents": config["agents"], "exploration": explored, "real_training": real_training}
 
 
 def main(overrides: Sequence[str]) -> None:

@@ -91,7 +91,6 @@ class ObjectiveConfig(Options, ABC):
     """What the configurations of sejax's objectives share."""
 
     group: ClassVar[str] = "objective"
-    scores_are_returns: ClassVar[bool] = False
 
     @abstractmethod
     def make(self, task: Task) -> Objective:
@@ -114,8 +113,6 @@ class MaxReward(ObjectiveConfig):
     Source: paper, Algorithm 1, EvaluateAgent; the curriculum: Liesen et al., "Discovering Minimal
     Reinforcement Learning Environments" (2024).
     """
-
-    scores_are_returns: ClassVar[bool] = True
 
     first_eval_steps: Count | None = None
     curriculum_generations: Count = 50

@@ -53,7 +53,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
             is_alone, folder = config.num_seeds == 1, config.run_dir
             folder = folder if is_alone else folder and f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    return runs
+    return [*{str(run.resolved_run_dir): run for run in runs}.values()]
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -87,11 +87,11 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     summary = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt as stop:
                     saved = f"{len(directory.rows)} generations are saved"
-                    message = f"Interrupted. {saved} in {directory.path}; the same command resumes"
+                    message = f"Interrupted. {saved} in {directory.folder}; the command resumes"
                     commands.interrupted(f"{message} from there.", stop)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if summary["ended"] == "diverged":
-                    diverged.append(directory.path)
+                    diverged.append(directory.folder)
                 elif len(configs) == 1:
                     progress.finish(directory, chunks.bilevel, scores[-1])
     if len(configs) > 1:

@@ -123,8 +123,9 @@ def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others
     config = evaluation(["proxy=cartpole", "agents=[ppo,sac]", "agents.ppo.epochs=3"])
     expected = {"ppo": dataclasses.replace(learned["ppo"], epochs=3), "sac": sejax.SACConfig()}
     assert config.agents == expected and config.agent_hparams == "default"
-    config = evaluation(["proxy=cartpole", "agent.discount=0.5"])  # of the task's own agent
-    assert config.agent == dataclasses.replace(learned["ddqn"], discount=0.5)
+    config = evaluation(["proxy=cartpole", "agents.ddqn.discount=0.5"])  # of all, one changed
+    assert config.agents == learned | {"ddqn": dataclasses.replace(learned["ddqn"], discount=0.5)}
+    assert evaluation(["proxy=cartpole", "exploration=none"]).agents == learned
 
 
 # --- sweeps ---------------------------------------------------------------------------------------
@@ -143,6 +144,8 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     assert len(folders) == 8 and all("noise_std" in folder for folder in folders)
     configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
+    assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
+    assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
     configs = evaluate.configs_of(["proxy=cartpole", "seed=1,2"])
     assert [x.out_dir for x in configs] == ["runs/evaluate-seed_1", "runs/evaluate-seed_2"]
 
@@ -216,10 +219,9 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agents=[ddqn,ppo] mixture.weights.ddqn=-1", "mixture.weights.ddqn", ""),
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
-    ("proxy=rn stop_when_solved=true", "stop_when_solved", "=false"),
     ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps",
      ""), ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
-    ("seeds=4", "seeds", "num_seeds?"),
+    ("seeds=4", "seeds", "num_seeds?"), ("es.mirrored=yes", "es.mirrored", "be true or false"),
     ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", "any more"),
 ])  # fmt: skip
 def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
@@ -234,6 +236,7 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
     ("proxy=real env=cartpole training.max_steps=9", "training"),
     ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
+    ("proxy=cartpole agent.discount=0.5", "agent.discount"),
     ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
     ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture"),
@@ -288,7 +291,7 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
 @pytest.mark.parametrize(("module", "words", "schema", "expected"), [
     (run, [], LearnConfig, ["agent.batch_size=64  # transitions", "preset=best", "env: cartpole"]),
     (run, ["agents=[ddqn,ppo]"], LearnConfig, ["mixture.weights.ddqn=1.0  # share"]),
-    (run, ["preset=paper", "seed=3"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
+    (run, ["preset=paper", "seed=3,4"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
     (evaluate, ["proxy=cartpole"], EvaluateConfig, ["agents.ppo.epochs=10  # passes", "(proxy)"]),
     (distill, [], DistillConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
 ])  # fmt: skip
@@ -324,6 +327,7 @@ def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
 @pytest.mark.parametrize(("agent", "batch_size"), [("sac", 64), ("ddqn", 7)])
 def test_an_agent_that_is_typed_takes_the_place_of_those_of_a_file(agent, batch_size, tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text("agents: {ddqn: {name: ddqn, batch_size: 7}}")
-    config = sejax.config([f"preset={path}", f"agent={agent}"])
-    assert {key: x.batch_size for key, x in config.agents.items()} == {agent: batch_size}
+    for text in ("agents: {ddqn: {name: ddqn, batch_size: 7}}", "agent: ddqn\nagent.batch_size: 7"):
+        path.write_text(text)
+        config = sejax.config([f"preset={path}", f"agent={agent}"])
+        assert {key: x.batch_size for key, x in config.agents.items()} == {agent: batch_size}

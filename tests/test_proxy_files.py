@@ -67,6 +67,8 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     assert proxy.config == known | {"run_dir": None}  # no path of a machine
     assert header.read(path).header.config == proxy.config
     assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
+    own = {"agents": {"mine": {"name": "my:Agent", "weight": 3}}}  # an own agent's own field
+    assert header.upgraded(own) == own
 
 
 def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):

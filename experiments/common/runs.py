@@ -91,7 +91,7 @@ def learn(
     curves = []
     for config in configs:
         with run_directory.RunDirectory(config, option) as directory:
-            path = directory.path / "cpu_s.txt"
+            path = directory.folder / "cpu_s.txt"
             session.run(config, directory, timed(chunks, path))
             curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
         there = int(curve["generation"].max()) + 1 if len(curve) else 0

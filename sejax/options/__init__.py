@@ -181,8 +181,9 @@ def option(
 
     Args:
       default: its default.
-      traced: whether it is a number that the compiled program takes as an argument, so that a
-        population may vary it without compiling anew. See `sejax.agents.traced`.
+      traced: whether it is a number that compiled programs can take as an argument, so that a
+        population may vary it without compiling anew; else it is a constant. See
+        `sejax.agents.traced`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
       names_code: whether its text may be a `module:attribute`, which the user must type.
     """
@@ -263,7 +264,7 @@ def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> An
         else:
             if isinstance(got, bool) == isinstance(value, bool):  # bools are numbers in Python
                 return value
-            must = "be no true or false"
+            must = f"be {'' if isinstance(value, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     fix = "VALUE" if is_open else as_text(default)
     raise ConfigError(f"{name} must {must}; got {shortened(repr(got))}. Set {name}={fix}.", name)

@@ -24,7 +24,7 @@ from sejax.options import (
     require_known,
     shortened,
 )
-from sejax.options.plain import configure, expanded, from_plain, merge
+from sejax.options.plain import configure, expanded, from_plain
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -130,12 +130,13 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     new = {name: x for name, x in config.items() if name not in none}
     if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
         new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
-    if isinstance(agents := new.setdefault("agents", {}), Mapping):
+    if isinstance(agents := new.setdefault("agents", {}), Mapping) and "mixture" not in new:
         of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
         by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
-        weights = {key: x.pop("weight") for key, x in by_key.items() if "weight" in x}
+        of_several = by_key if len(by_key) > 1 else {}
+        weights = {key: x.pop("weight") for key, x in of_several.items() if "weight" in x}
         if of_all or weights:
-            new["mixture"] = merge(new.get("mixture", {}), of_all, {"weights": weights})
+            new["mixture"] = of_all | {"weights": weights}
         new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
     return new
 

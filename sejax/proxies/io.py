@@ -64,10 +64,12 @@ class _Loaded:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        agents = self.config["agents"].values()
-        of_agent = next(iter(agents)) if len(agents) == 1 else None
-        values = of_agent if group == "agent" else self.config.get(group)
-        return header.configured(group, values, self.path.name)
+        if group != "agent":
+            return header.configured(group, self.config.get(group), self.path.name)
+        agents = self.learned_agents()
+        got = f"got {', '.join(agents) or 'none'}. Take learned_agents()"
+        require(len(agents) == 1, "agent", f"must be the only one; {got}.")
+        return next(iter(agents.values()))
 
     def learned_agents(self) -> dict[str, Any]:
         """The agent that it was learned with, or the mixture of agents, by their keys.

@@ -120,8 +120,11 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
             must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
             raise ConfigError(must, "preset") from error
     typed = _tree(texts, groups)
+    named = file.get("agents", {})
+    if len(named) == 1:
+        file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
     if names := names_of(typed["agents"]):  # they replace the file's agents
-        file["agents"] = {key: x for key, x in file.get("agents", {}).items() if key in names}
+        file["agents"] = {key: x for key, x in named.items() if key in names}
     return merge(file, typed)
 
 
@@ -186,7 +189,8 @@ def swept(
       folder_of: else gives the folder, for a configuration and a name made of the swept words.
       known: fields that default folders are already named by.
     """
-    configs = []
+    configs, by_name = [], {override.partition("=")[0]: override for override in overrides}
+    overrides = [*by_name.values()]  # of words with one name the last counts
     for of_run in expand(overrides):
         config = make(of_run)
         folder = getattr(config, field)
@@ -225,21 +229,21 @@ def choice(fields: Mapping[str, Any], group: str) -> str:
     return str(fields.get("name", next(iter(registry.BUILT_IN[group]))))
 
 
-def preset_of(words: Tree, imports: Collection[str]) -> Tree:
-    """The settings of a preset, for the choices of words.
+def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
+    """The settings of a preset, for typed choices.
 
     A section's `with_agent` may also set fields of other groups; they count only if there is one
     agent.
 
     Args:
-      words: see `read`, with the names of all agents.
+      typed: see `read`, with the names of all agents.
       imports: each `module:attribute` that may be imported.
 
     Raises:
       ConfigError: for an unknown proxy or preset, or a preset that the task does not have.
     """
-    name = str(words.get("preset", "best"))
-    env, proxy, es = (choice(words.get(group, {}), group) for group in ("env", "proxy", "es"))
+    name = str(typed.get("preset", "best"))
+    env, proxy, es = (choice(typed.get(group, {}), group) for group in ("env", "proxy", "es"))
     sections = sections_of(env, proxy)
     if name not in sections:
         ranked = nearest(name, sections)
@@ -248,9 +252,9 @@ def preset_of(words: Tree, imports: Collection[str]) -> Tree:
         raise ConfigError(f"{must}; {got}", "preset")
     section = sections[name]
     default = registry.find("proxy", proxy, imports).default_objective
-    objective = merge({"name": default}, section.get("objective", {}), words.get("objective", {}))
+    objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))
     of_names = section.get("with_agent", {})
-    beside = {key: of_names.get(x, {}) for key, x in names_of(words["agents"]).items()}
+    beside = {key: of_names.get(x, {}) for key, x in names_of(typed["agents"]).items()}
     settings = merge(
         {key: x for key, x in section.items() if not key.startswith("with_")},
         section.get("with_es", {}).get(es, {}),

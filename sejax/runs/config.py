@@ -85,11 +85,11 @@ class CommandConfig(Options):
 
     @classmethod
     @abstractmethod
-    def layers_below(cls, words: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
-          words: see `sejax.runs.compose.read`.
+          typed: the tree of the words; see `sejax.runs.compose.read`.
           imports: each `module:attribute` that may be imported.
 
         Raises:
@@ -112,7 +112,7 @@ class CommandConfig(Options):
         with errors_of("" if others else f"agents.{shortened(first, 40)}", "agent"):
             config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
         for name in [name for name in tree if name not in known]:
-            raise unknown_field(str(name), config.words(config.plain()))
+            raise unknown_field(str(name), config.named(config.plain()))
         return config
 
     @property
@@ -129,14 +129,14 @@ class CommandConfig(Options):
         """Nested plain values, as in `config.yaml`; `sejax.save` keeps them with a proxy."""
         return to_plain(self)  # type: ignore[no-any-return]
 
-    def words(self, tree: Tree) -> dict[str, Any]:
+    def named(self, tree: Tree) -> dict[str, Any]:
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
         by_key = {f"agents.{key}": self.field_of(key) for key in self.agents}
-        words = {}
+        flat = {}
         for name, value in flatten(tree).items():
             group = ".".join(name.split(".")[:2])
-            words[by_key.get(group, group) + name.removeprefix(group)] = value
-        return {name.removesuffix(".name"): x for name, x in words.items()}
+            flat[by_key.get(group, group) + name.removeprefix(group)] = value
+        return {name.removesuffix(".name"): x for name, x in flat.items()}
 
     def require_learning(
         self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec
@@ -215,10 +215,6 @@ class LearnConfig(CommandConfig):
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
         message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
         require(is_here, "devices", message)
-        if self.stop_when_solved and not getattr(self.objective, "scores_are_returns", True):
-            must = f"must be false with objective={self.name('objective')}, whose scores are no"
-            message = f"stop_when_solved {must} returns. Set stop_when_solved=false."
-            raise ConfigError(message, "stop_when_solved")
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
         is_alone, given = len(self.agents) == 1, self.mixture.weights
@@ -262,14 +258,14 @@ class LearnConfig(CommandConfig):
         }
 
     @classmethod
-    def layers_below(cls, words: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
-        agent_names = compose.names_of(words["agents"])
+        agent_names = compose.names_of(typed["agents"])
         if not agent_names:
-            default = default_agent(words.get("env", {}), imports)
+            default = default_agent(typed.get("env", {}), imports)
             agent_names = {default: default}
         of_agents = {"agents": {key: {"name": name} for key, name in agent_names.items()}}
-        preset = compose.preset_of(merge(of_agents, words), imports)
+        preset = compose.preset_of(merge(of_agents, typed), imports)
         return {"default": of_agents, f"preset={preset['preset']}": preset}
 
     @property
@@ -305,15 +301,15 @@ def config(overrides: Sequence[str] = (), command: Any = LearnConfig) -> Any:
 
 def layers_of(command: type[CommandConfig], overrides: Sequence[str]) -> dict[str, Tree]:
     """The layers that a command's words make, by their names; the words are the last one."""
-    words = compose.read(overrides, command.groups())
-    layers = command.layers_below(words, compose.plugin_paths(overrides))
-    of_only, chosen = words.pop("agent", {}), [*merge(*layers.values())["agents"]]
+    typed = compose.read(overrides, command.groups())
+    layers = command.layers_below(typed, compose.plugin_paths(overrides))
+    of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
     for name, value in flatten(of_only).items():
         full, got = f"agents.{chosen[0]}.{name}", shortened(value)
         message = f"must be one agent's; got {got}. Set {full}={got}."
         require(len(chosen) == 1, f"agent.{name}", message)
-    words["agents"] = merge({chosen[0]: of_only}, words["agents"])
-    return layers | {"typed": words}
+    typed["agents"] = merge({chosen[0]: of_only}, typed["agents"])
+    return layers | {"typed": typed}
 
 
 def default_agent(env: Tree, imports: Collection[str]) -> str:
@@ -330,6 +326,7 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     It lists the choices of each group, then the fields of the words' choices. If a value is not the
     default, the layer that sets it stands beside it.
     """
+    overrides = compose.expand(overrides)[0]  # the first run of a sweep
     layers, choices = layers_of(command, overrides), ("agent", *command.groups())
     config = command.of_tree(merge(*layers.values()), compose.plugin_paths(overrides))
     lines = ["Choices (group=choice):"]
@@ -347,9 +344,9 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     sources = dict[str, str]()
     for layer, tree in layers.items():
         source = "" if layer == "default" else f" ({layer})"
-        sources |= dict.fromkeys(config.words(tree), source)
+        sources |= dict.fromkeys(config.named(tree), source)
     named = (*choices, *map(config.field_of, config.agents))
-    fields = {name: x for name, x in config.words(config.plain()).items() if name not in named}
+    fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 

@@ -55,7 +55,7 @@ class RunProgress:
 
     def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how the run ended, where its files are, and what to do next."""
-        path, solved_score = directory.path, bilevel.solved_score
+        path, solved_score = directory.folder, bilevel.solved_score
         is_solved = solved_score is not None and best >= solved_score
         verdict = f"best search mean {best:.1f}"
         if solved_score is not None:

@@ -55,8 +55,8 @@ class RunDirectory(Store):
       field: the field that names the folder, for messages.
 
     Attributes:
-      path: the folder: new, or from an earlier session of the same run.
-      config: the configuration, plain values in nested mappings.
+      folder: new, or from an earlier session of the same run.
+      settings: the configuration, plain values in nested mappings.
       columns: the columns of `metrics.csv`; several agents have four more each.
       rows: the rows of `metrics.csv`, one for each saved generation, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
@@ -72,7 +72,6 @@ class RunDirectory(Store):
             free=FREE_FIELDS,
             completed=lambda stored: configuration.completed(stored, config),
         )
-        self.path, self.config = self.folder, self.settings
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
         self.versions: object = runtime.versions()
@@ -147,7 +146,7 @@ class RunDirectory(Store):
         if is_first:
             self._remake()
         else:
-            write_text(self.path / _METRICS, csv)
+            write_text(self.folder / _METRICS, csv)
         return new
 
     def _as_csv(self, rows: Iterable[Mapping[str, str]]) -> str:
@@ -159,9 +158,9 @@ class RunDirectory(Store):
         """Reads the checkpoint, if there is one."""
         entry = self.get(_CHECKPOINT)
         if entry is None:  # then the folder must hold no run, also none of an older sejax
-            for name in filter(lambda name: (self.path / name).exists(), _SIGNS_OF_A_RUN):
+            for name in filter(lambda name: (self.folder / name).exists(), _SIGNS_OF_A_RUN):
                 must = "must be new or hold the checkpoint of its run"
-                raise self.refused(f"{must}; got {self.path}, whose {name} would be replaced")
+                raise self.refused(f"{must}; got {self.folder}, whose {name} would be replaced")
             return
         tensors, values = entry
         try:
@@ -185,7 +184,7 @@ class RunDirectory(Store):
         for i, agent in enumerate(self._agents):
             for name in AGENT_COLUMNS:
                 values[f"{name}_{agent}"] = np.asarray(vars(info.by_agent)[name])[:, i]
-        fixed = {"seed": str(self.config["seed"]), "wall_s": f"{wall_s:.3f}"}
+        fixed = {"seed": str(self.settings["seed"]), "wall_s": f"{wall_s:.3f}"}
         cells = [
             fixed | {name: _as_text(column[i]) for name, column in values.items()}
             for i in np.flatnonzero(info.active)
@@ -194,10 +193,10 @@ class RunDirectory(Store):
 
     def _remake(self) -> None:
         """Writes the text files that differ from the checkpoint."""
-        remove_leftovers(self.path, _WRITTEN)
-        config = yaml.safe_dump(self.config, sort_keys=False)
+        remove_leftovers(self.folder, _WRITTEN)
+        config = yaml.safe_dump(self.settings, sort_keys=False)
         for name, text in ((_CONFIG, config), (_METRICS, self._as_csv(self.rows))):
-            path = self.path / name
+            path = self.folder / name
             if not path.exists() or path.read_bytes() != text.encode():
                 write_text(path, text)
 

@@ -56,9 +56,9 @@ def run(
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn = time.monotonic()
-    folder, first = directory.path.resolve(), len(directory.rows)
-    tracked = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.config)
-    guarded = GuardedTracker(config.tracker, tracked, report.say)
+    folder, first = directory.folder.resolve(), len(directory.rows)
+    run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
+    guarded = GuardedTracker(config.tracker, run, report.say)
     with contextlib.closing(guarded) as tracker:
         while not (state.solved or _all_diverged(directory, bilevel)):
             first = len(directory.rows)
@@ -81,7 +81,7 @@ def run(
         draw(config, directory, bilevel)
     ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
     generations, agents = len(directory.rows), sum(bilevel.evaluate.sizes)
-    summary_file = directory.path / "run.json"
+    summary_file = directory.folder / "run.json"
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # none, or damaged
         stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
         if (stored["generations"], stored["ended"]) == (generations, ended):
@@ -89,7 +89,7 @@ def run(
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = {
         "ended": ended,
-        "best_score": float(state.best_score),
+        "best_score": float(state.best_score) if state.best_generation >= 0 else None,
         "solved_score": bilevel.solved_score,
         "wall_s": round(start_wall_s + time.monotonic(), 1),
         "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
@@ -110,7 +110,7 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgre
     state = chunks.init(jax.random.key(seed))
     restored = directory.restore(state)
     if restored is not None:
-        report.say(f"Resuming at generation {len(directory.rows)} of {directory.path}.")
+        report.say(f"Resuming at generation {len(directory.rows)} of {directory.folder}.")
         here, there = runtime.versions(), directory.versions
         if there != here:
             report.say(f"It was made with {there}; here are {here}. Numbers may move.")
@@ -187,9 +187,9 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
     first_agent, names = bilevel.scoring.mixture.agents[0], bilevel.scoring.mixture.names
     discount = first_agent.discount(first_agent.hparams)
     # A proxy does not depend on the tracker, nor on the machines.
-    config = {k: v for k, v in directory.config.items() if k not in ("tracker", "machines")}
+    config = {k: v for k, v in directory.settings.items() if k not in ("tracker", "machines")}
     for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
-        path = directory.path / f"{name}.safetensors"
+        path = directory.folder / f"{name}.safetensors"
         if (generation < first and path.exists()) or not np.isfinite(flat).all():
             continue
         by_agent = dict(zip(names, map(float, scores), strict=True))
@@ -201,7 +201,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
             None if discount is None else float(discount),
             score=float(score),
             generation=int(generation),
-            seed=directory.config["seed"],
+            seed=directory.settings["seed"],
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
 
@@ -209,7 +209,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
 def draw(config: LearnConfig, directory: RunDirectory, bilevel: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
     if directory.rows:
-        path = directory.path / "learning_curve.png"
+        path = directory.folder / "learning_curve.png"
         title = ", ".join(map(config.name, ("env", "proxy", "agent")))
         plots.learning_curve(directory.rows, bilevel.solved_score, path, title)
 

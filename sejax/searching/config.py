@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require, shortened
@@ -40,8 +40,6 @@ class StudyConfig(Options):
         is the luckiest too.
       fresh_seeds: new seeds of each trial that is tried again
     """
-
-    group: ClassVar[str] = ""
 
     trials: Count = 60
     min_generations: Count = 3
@@ -138,11 +136,11 @@ def read(overrides: Sequence[str]) -> StudyPlan:
     if preset is not None:
         by_key = default.agents.items()
         agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
-        typed = default.words(layers_of(LearnConfig, fixed)["typed"])
+        typed = default.named(layers_of(LearnConfig, fixed)["typed"])
         for name, dimension in spaces.preset(preset, agents).items():
             if name not in typed:
                 space.setdefault(name, dimension)
-    fields = default.words(default.plain())
+    fields = default.named(default.plain())
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
     must = "must be given and have ranges for these agents, or fields must have some; got none"

@@ -61,7 +61,7 @@ def open_study(search: StudyPlan) -> optuna.Study:
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
-            fields = search.default.words(search.default.plain())
+            fields = search.default.named(search.default.plain())
             first = {x.parameter: x.parameter_of(fields[name]) for name, x in search.space.items()}
             if None not in first.values():
                 study.enqueue_trial(first, skip_if_exists=True)
@@ -276,7 +276,7 @@ def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     """Writes settings as a command and as a preset; returns the command."""
     words = [*search.fixed, *overrides]
     line = shlex.join(["python", "-m", "sejax.run", *words])
-    read = search.default.words(layers_of(LearnConfig, words)["typed"])
+    read = search.default.named(layers_of(LearnConfig, words)["typed"])
     settings = {k: parsed(x) if isinstance(x, str) else x for k, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
     write_text(search.folder / "best.txt", f"{line}\n")
