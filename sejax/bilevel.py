@@ -169,8 +169,8 @@ def make_learner(
     `jax.jit` makes it one executable with the scan inside; `vmap` over keys makes several runs.
 
     Args:
-      config: from `sejax.config`; replaces all other arguments. Its `seed`, `run_dir` and
-        `checkpoint_every` are for the command and have no effect here.
+      config: from `sejax.config`, with all parts and `generations`. What is for the command, such
+        as `seed` and `run_dir`, has no effect here.
       generations: n_o of Algorithm 1.
       **parts: arguments of `make_bilevel`: `task`, `agent`, and any others.
 
@@ -189,8 +189,8 @@ def make_learner(
       (2,)
     """
     if config is not None:
-        if not isinstance(config, RunConfig):
-            raise TypeError(f"config must come from sejax.config([...]); got {config!r:.60}.")
+        if not isinstance(config, RunConfig) or parts:
+            raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
     checked([generations], Count, "generations", 100)
     bilevel = make_bilevel(**parts)
