@@ -216,6 +216,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
     ("es.population_size=1.5", "es.population_size", ""), ("agents=[ddqn,td3]", "agents.td3", ""),
     ("stop_when_solved=maybe", "stop_when_solved", ""), ("agents=[ddqn,ddqn]", "agents", ""),
+    ("agents=[ddqn,ppo] mixture.weights.ddqn=0 mixture.weights.ppo=0", "mixture.weights", ""),
     ("agents=[ddqn,ppo] mixture.weights.ddqn=-1", "mixture.weights.ddqn", ""),
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),

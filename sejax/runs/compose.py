@@ -83,11 +83,10 @@ def partition(overrides: Sequence[str], command: type) -> tuple[Tree, dict[str, 
     Raises:
       ConfigError: as `words`.
     """
-    own: Tree = {}
-    others = {}
+    own, others, known = Tree(), dict[str, str](), fields_of(command)
     for name, text in words(overrides).items():
         group, _, field = name.partition(".")
-        if group in fields_of(command):
+        if group in known:
             own = merge(own, {group: {field: text} if field else text})
         else:
             others[name] = text

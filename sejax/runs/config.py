@@ -34,7 +34,6 @@ from sejax.options import (
 )
 from sejax.options.plain import (
     configure,
-    fields_of,
     flatten,
     from_plain,
     merge,
@@ -103,7 +102,7 @@ class CommandConfig(Options):
         Raises:
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
         """
-        known = fields_of(cls)
+        known = {field.name for field in dataclasses.fields(cls)}
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         message = f"must be agents by keys that are words; got {shortened(by_key)}."
@@ -223,6 +222,8 @@ class LearnConfig(CommandConfig):
         for key in given:
             require_known("mixture.weights", key, self.agents)
         weights = {} if is_alone else {key: given.get(key, 1.0) for key in self.agents}
+        are_some = is_alone or any(weights.values())
+        require(are_some, "mixture.weights", "must have one above 0. Leave one of them out.")
         object.__setattr__(self, "mixture", dataclasses.replace(self.mixture, weights=weights))
         for key, agent in self.agents.items():
             field = self.field_of(key)
