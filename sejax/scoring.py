@@ -133,12 +133,13 @@ class Scoring:
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
     ) -> GenerationInfo:
         """The statistics of a generation."""
+        is_finite = jnp.isfinite(scores.population)
         return GenerationInfo(
             generation=generation,
             incumbent_mean=scores.incumbent_mean,
             incumbent_std=jnp.nanstd(scores.incumbent),
             population_mean=finite_mean(scores.population),
-            population_max=jnp.nanmax(scores.population),
+            population_max=jnp.nanmax(jnp.where(is_finite, scores.population, jnp.nan)),
             best_so_far=best,
             train_steps_mean=outcome.train_steps.mean(),
             train_steps_max=outcome.train_steps.max(),

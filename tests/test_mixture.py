@@ -213,13 +213,13 @@ def test_the_columns_of_each_agent_are_means_over_its_trainings(two):
     np.testing.assert_array_equal(info.real_steps, outcome.real_steps)
 
 
-def told(incumbents, state=None, stop_when_solved=True, **config):
-    """State and info after a generation whose candidates returned 0, and the incumbent these."""
+def told(incumbents, state=None, stop_when_solved=True, candidates=(0, 0), **config):
+    """State and info after a generation whose candidates and incumbent returned these."""
     bilevel = bilevel_of(
         Mixture(agents=AGENTS, config=MixtureConfig(**config)), stop_when_solved=stop_when_solved,
         es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=len(incumbents)),
     )  # fmt: skip
-    outcome = outcome_of([0, 0, *incumbents])
+    outcome = outcome_of([*candidates, *incumbents])
     state = bilevel.init(KEY) if state is None else state
     return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcome))(state)
 
@@ -241,6 +241,11 @@ def test_the_incumbents_agents_that_diverged_rank_last_within_their_agent():
     _, info = told([4, 5, NAN, NAN, -3, 7])
     np.testing.assert_allclose(info.by_agent.incumbent_mean, [(4 - 3 - 3) / 3, (5 + 0 + 7) / 3])
     np.testing.assert_array_equal(info.by_agent.num_nonfinite, [1, 1])
+
+
+def test_a_candidate_of_infinite_score_is_counted_and_no_maximum():
+    _, info = told([4, 5], candidates=[INF, 3])
+    assert (info.population_max, info.population_mean, info.num_nonfinite) == (3, 3, 1)
 
 
 @pytest.mark.parametrize("aggregate", ["mean", "min"])

@@ -203,6 +203,32 @@ def test_prepared_params_look_up_what_the_network_says():
     assert make_env("cartpole").prepare(params, GAMMA).potentials is None
 
 
+def test_an_augmented_network_sees_a_discrete_state_and_its_info():
+    """The potential in NumPy; agents of whole trainings too, whose params are prepared."""
+
+    class Lit(Wrapper):
+        def step_env(self, key, state, action, params):
+            *stepped, info = self.env.step_env(key, state, action, params)
+            return *stepped, info | {"light": jnp.float32(stepped[0] % 3)}
+
+    keys = {"info_keys": ("light",), "augmented_keys": ("light",)}
+    walk = envs.make("cliff_walking")
+    task = sejax.Task(name="lit", env=Lit(walk.env), max_steps=50, solved_reward=-20, **keys)
+    env = RewardConfig(variant="exclusive_potential", augmented=True, hidden_size=5).make(task)
+    params = env.prepare(env.params(env.init_weights(KEY)), GAMMA)
+    obs, state = env.reset_env(KEY, params)
+    seen = [np.append(np.eye(48)[obs], 0)]  # no step has told the light yet
+    for action in (0, 1, 1):
+        obs, state, reward, *_ = env.step_env(KEY, state, jnp.int32(action), params)
+        seen.append(np.append(np.eye(48)[obs], obs % 3))
+        weights = params.weights["potential"]
+        before, after = (numpy_forward(weights, x, "prelu", 1)[0] for x in seen[-2:])
+        np.testing.assert_allclose(reward, GAMMA * after - before, rtol=1e-4, atol=1e-6)
+    agent = make_agent(QLearningConfig(), task)
+    result = make_trainer(agent, env, TrainingConfig(max_episodes=3, max_steps=150))(KEY, params)
+    assert result.episodes == 3 and not result.nonfinite
+
+
 LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2",
          "training.max_episodes=12"]  # fmt: skip
 

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from gymnasium import ObservationWrapper
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
-from gymnasium.spaces import Discrete, Space, flatdim
+from gymnasium.spaces import Discrete, Space, flatdim, flatten
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
@@ -80,7 +80,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
-        if isinstance(env.observation_space, Discrete) and self._layers:
+        if isinstance(env.observation_space, Discrete) and self._layers and not keys:
             self._table = self._apply(np.eye(num_inputs)).tolist()
         self._potential = 0.0  # of the agent's state
 
@@ -114,7 +114,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             return self._table[obs]
         if not self._layers:
             return 0.0
-        return float(self._apply(np.concatenate([obs, info_values]) if len(info_values) else obs))
+        if len(info_values):
+            obs = np.concatenate([flatten(self.env.observation_space, obs), info_values])
+        return float(self._apply(obs))
 
     def _apply(self, inputs: np.ndarray) -> np.ndarray:
         x = np.asarray(inputs, np.float32)

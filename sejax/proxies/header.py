@@ -158,7 +158,7 @@ def configured(group: str, values: object, where: str) -> Any:
       ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
-        return configure(group, values)  # type: ignore[arg-type]
+        return configure(group, values, ())  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field = PLUGIN_ARGUMENTS.get(group, group)
     word = PLUGIN_WORDS.get(group, group)

@@ -187,8 +187,8 @@ class RewardEnv(ProxyEnv):
     ) -> RewardParams:
         """Params for the whole training of one agent, with its discount.
 
-        If states are discrete, all potentials are computed at once, and each step looks up two of
-        them. They hold for these weights alone: call it again for other weights.
+        If states are discrete and all that the network sees, all potentials are computed at once, and
+        each step looks up two of them. They hold for these weights alone: call it again for other weights.
 
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.
@@ -197,7 +197,8 @@ class RewardEnv(ProxyEnv):
         must = f"must have a discount for {self.config.variant}"
         require(is_known, "agent", f"{must}; got none. Set Agent(discount=lambda hparams: ...).")
         potentials = None
-        if self.task.num_states is not None and not self.config.shaping.weighs_info:
+        sees_info = self.config.shaping.weighs_info or self._augmented_keys
+        if self.task.num_states is not None and not sees_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
         known = {"discount": jnp.float32(1.0 if discount is None else discount)}
