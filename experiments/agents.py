@@ -27,10 +27,9 @@ import sejax
 from experiments.common import figures, tables
 from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.statistics import difference_interval
-from sejax.agents.fixed import make_fixed
 from sejax.envs import with_one_done
 from sejax.envs.wrappers import repeat_actions
-from sejax.evaluation import make_tester
+from sejax.evaluation import make_fixed, make_tester
 from sejax.gym import GYMNASIUM_IDS
 from sejax.options import Count
 from sejax.options.plain import configure, to_plain

@@ -37,7 +37,7 @@ STOCK = {True: ("ppo", "a2c", "dqn"), False: ("ppo", "a2c", "sac", "td3")}  # fo
 STUDENTS = {
     "sb3_defaults": "SB3, defaults",
     "sb3_zoo": "SB3, RL Zoo's settings",
-    "sejax_default": "sejax (which taught ours)",
+    "sejax_default": "sejax, defaults",
     "sejax_varied": "sejax, random hyperparameters",
 }
 SES = {"ours": figures.FIXED, "theirs": figures.REAL}
@@ -180,6 +180,7 @@ def stock_students(
     except ImportError as error:
         fix = "Type pip install 'sejax[bench]', or set students=[sejax_default,sejax_varied]"
         raise ConfigError(f"students must be installed; got {error}. {fix}.", "students") from error
+    se_of_rows = {"world": se, "fingerprint": sejax.load_proxy(source).fingerprint}
     seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
     for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):
         agent = kind.upper() if sort == "sb3_defaults" else kind
@@ -192,7 +193,7 @@ def stock_students(
 
         shard = f"{task.name}-{se}-{sort}-{kind}-{seed}"
         if settings.is_wanted(shard):
-            depends = training._asdict() | {"world": se}
+            depends = training._asdict() | se_of_rows
             yield settings.shards.compute(shard, depends, train).assign(kind=kind, seed=seed)
 
 
@@ -235,9 +236,11 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """
     students = unstack(rows, "students")
     by = ["students", "kind", "task"]
+    is_on_both = students.groupby([*by, "seed", "steps"])["se"].transform("nunique") == len(SES)
     least = [BEFORE_LEARNING.get(cell, 0) for cell in students[by].itertuples(index=False)]
-    is_on_both = students.groupby(by)["se"].transform("nunique") == len(SES)
-    students = students[is_on_both & (students["steps"] > least)]
+    students = students.assign(least=least)[is_on_both]
+    of_all = students.groupby(["students", "task"])["least"].transform("max")
+    students, all_kinds = (students[students["steps"] > x] for x in (students["least"], of_all))
 
     def statistics(mine: pd.DataFrame) -> dict[str, Any]:
         name = mine["task"].iloc[0]
@@ -249,7 +252,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
                 columns[f"{se}_{measure}_{steps:.0f}"] = value
         return columns
 
-    both = pd.concat([students.assign(kind=ALL), students])
+    both = pd.concat([all_kinds.assign(kind=ALL), students])
     return tables.summary_by(both, ["task", "students", "kind"], statistics)
 
 
@@ -261,14 +264,12 @@ def report(settings: Peers, rows: pd.DataFrame) -> pd.DataFrame:
         "students": "{label}",
         "algorithm": lambda row: row.kind if row.kind == ALL else figures.agent_name(row.kind),
     }
-    *fewer, most = settings.steps
-    for se in SES:
-        columns |= {f"{se}, {steps:,} steps": f"{{{se}_mean_{steps}:,.1f}}" for steps in fewer}
-        columns[f"{se}, {most:,} steps"] = CELL.replace("SE", se).replace("N", str(most))
+    for steps, se in itertools.product(settings.steps, SES):
+        columns[f"{se}, {steps:,} steps"] = CELL.replace("SE", se).replace("N", str(steps))
     note = (
         "Mean returns of agents after so many steps on the SE, in ten episodes of the real task; "
-        "after the most steps with median and worst agent, share that solves the task and number "
-        "of agents. All: the agents of all algorithms together."
+        "median and worst agent, share that solves the task and number of agents. All: the agents "
+        "of all algorithms together, once each has learned. Empty: before the first update."
     )
     title = "The same students on our SEs and on synthetic-gymnax's"
     table = tables.as_texts(summary, columns).replace("^nan.*", "", regex=True)

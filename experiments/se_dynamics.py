@@ -29,7 +29,7 @@ from experiments.common.runs import RunSettings
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
 from sejax.options import Count
-from sejax.runs import workers
+from sejax.runs.chunks import make_chunks
 
 # On Pendulum, preset=best has a reward whose best action is known.
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", "proxy.reward_form=network")
@@ -108,7 +108,7 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
     curves, tests = [], [se_myopia.untrained(settings, task, tuned)]
     for kind in settings.kinds:
         config = settings.config_of(kind)
-        chunks = workers.make_chunks(config)
+        chunks = make_chunks(config)
         folder = settings.work_folder / "runs" / kind
         for run in runs.configs_of(config, settings.runs, folder):
             own = {"kind": kind, "seed": run.seed}

@@ -105,9 +105,13 @@ class Bilevel:
         return copy_to_devices(state, self.evaluate.devices)
 
     def generation(self, state: LearnState) -> tuple[LearnState, GenerationInfo]:
-        """One pass of Algorithm 1's outer loop; a scan body."""
+        """One pass of Algorithm 1's outer loop."""
         candidates = self.ask(state)
         return self.tell(state, candidates, self.evaluate(candidates))
+
+    def generations(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
+        """Several passes; leaves of the info are `[length, ...]`."""
+        return jax.lax.scan(lambda state, _: self.generation(state), state, length=length)
 
     def ask(self, state: LearnState) -> Candidates:
         """The population around the incumbent, and a key for each of their trainings."""
@@ -196,9 +200,7 @@ def make_learner(
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:
-        state, info = jax.lax.scan(
-            lambda state, _: bilevel.generation(state), bilevel.init(key), length=generations
-        )
+        state, info = bilevel.generations(bilevel.init(key), generations)
         return LearnResult(
             weights=bilevel.unravel(state.best),
             score=state.best_score,

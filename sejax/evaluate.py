@@ -210,13 +210,11 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or agents that
         do not fit it.
     """
-    if config.proxy == "real":
-        require(config.env, "env", "must be given with proxy=real. Set env=cartpole.")
-        proxy, task, real_training = None, envs.make(str(config.env)), config.real_training
-    else:
-        proxy = loaded(config)
-        task, real_training = proxy.task, config.real_training
-    trainings = {}
+    is_given = config.proxy != "real" or config.env
+    require(is_given, "env", "must be given with proxy=real. Set env=cartpole.")
+    proxy = None if config.proxy == "real" else loaded(config)
+    task = envs.make(str(config.env)) if proxy is None else proxy.task
+    real_training, trainings = config.real_training, {}
     for key, agent in config.agents.items():
         agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
         group, training = "real_training", real_training

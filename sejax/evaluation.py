@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentState, Hparams
+from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, sizes_of
+from sejax.agents.buffers import no_buffer
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.wrappers import repeat_actions
@@ -174,6 +175,30 @@ def make_recorder(
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
 
     return record
+
+
+def make_fixed(task: Task, act: Callable[[Array, Any, Array], Array]) -> Agent:
+    """A policy as an agent, for `make_tester` and `make_recorder`; it learns nothing.
+
+    Args:
+      task: gives the observations and actions.
+      act: `(key, state, obs) -> action`; the agent's state is whatever the policy needs.
+
+    Example:
+      >>> import sejax
+      >>> task = sejax.envs.make("cartpole")
+      >>> agent = make_fixed(task, lambda key, gain, obs: (obs[2] + gain * obs[3] > 0).astype(int))
+      >>> make_tester(agent, task, 3)(jax.random.key(0), 0.5).returns.tolist()
+      [200.0, 200.0, 200.0]
+    """
+    return Agent(
+        init=lambda key, hparams: (),
+        act=lambda key, state, obs, /, explore: act(key, state, obs),
+        update=lambda key, state, batch: state,
+        buffer=no_buffer(),
+        hparams=Hparams(),
+        spec=AgentSpec(sizes=sizes_of(task.observation, task.action)),
+    )
 
 
 # --- one fresh agent ------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ CONFIG = DDQNConfig(
 )  # fmt: skip
 EXACT = [activation for activation in get_args(Activation) if activation != "fast_tanh"]
 CASES = {activation: replace(CONFIG, activation=activation) for activation in EXACT} | {
-    "dqn": replace(CONFIG, double=False),
+    "dqn": replace(CONFIG, double=False)
 }
 DUELING = DuelingDDQNConfig(
     hidden_size=5, num_layers=2, feature_dim=4, stream_hidden_size=6, stream_num_layers=1,

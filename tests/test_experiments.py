@@ -25,7 +25,7 @@ from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax.options import ConfigError, Count
 from sejax.options.plain import configure
-from sejax.runs import workers
+from sejax.runs.chunks import Chunks
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
          if module.name not in ("__main__", "common")]  # fmt: skip
@@ -112,7 +112,7 @@ def tiny(monkeypatch):
 
 
 def refuse_to_compute(monkeypatch):
-    places = {agents: "train", workers.Chunks: "advance"}
+    places = {agents: "train", Chunks: "advance"}
     for place, name in places.items():
         monkeypatch.setattr(place, name, refuse)
 

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 from support import assert_close, numpy_forward, random_like, shapes_of
 
-from sejax.ops.networks import (
-    MLP,
-    PRELU_SLOPE,
-    affine,
-    fast_tanh,
-    tanh,
-)
+from sejax.ops.networks import MLP, PRELU_SLOPE, affine, fast_tanh, tanh
 from sejax.options import Activation
 
 

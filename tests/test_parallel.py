@@ -7,11 +7,7 @@ import pytest
 from support import assert_close, assert_equal
 
 from sejax.ops.networks import MLP
-from sejax.ops.parallel import (
-    in_batches_on_cpu,
-    spread_groups_over_devices,
-    spread_over_devices,
-)
+from sejax.ops.parallel import in_batches_on_cpu, spread_groups_over_devices, spread_over_devices
 
 
 def work(key, x):

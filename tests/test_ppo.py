@@ -8,14 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import (
-    assert_shares,
-    drawing,
-    numpy_forward,
-    raveled,
-    refused,
-    unraveled,
-)
+from support import assert_shares, drawing, numpy_forward, raveled, refused, unraveled
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition

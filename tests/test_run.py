@@ -20,8 +20,9 @@ from support import metrics as rows
 
 import sejax
 from sejax import run
-from sejax.runs import commands, run_directory, runtime, session, workers
+from sejax.runs import commands, run_directory, runtime, session
 from sejax.runs import config as configuration
+from sejax.runs.chunks import Chunks, make_chunks
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
 
@@ -36,7 +37,7 @@ START = functools.partial(commands.start, run.main, run.help_text, run.configs_o
 @functools.cache
 def chunks(*words):
     """The compiled program of a configuration, which all runs of it share."""
-    return workers.make_chunks(sejax.config(words))
+    return make_chunks(sejax.config(words))
 
 
 def learn(path, *words, program=(), base=TINY):
@@ -113,10 +114,8 @@ def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, monkey
 def test_seeds_run_one_after_the_other_on_one_executable(
     uninterrupted, tmp_path, monkeypatch, capsys
 ):
-    compiled, compile_ = [], workers.Chunks.compile
-    monkeypatch.setattr(
-        workers.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
-    )
+    compiled, compile_ = [], Chunks.compile
+    monkeypatch.setattr(Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n)))
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
     best = run.learn_all(run.configs_of([*TINY, *words]))
     assert compiled == [2]

@@ -10,8 +10,9 @@ import pytest
 from support import ROOM, bits, printed, refusal, refused
 
 import sejax
-from sejax.runs import runtime, workers
-from sejax.runs.workers import Chunks, RemoteChunks
+from sejax.runs import ray, runtime
+from sejax.runs.chunks import Chunks
+from sejax.runs.ray import RemoteChunks
 
 
 def require_equal_numbers(words, generations):
@@ -22,11 +23,12 @@ def require_equal_numbers(words, generations):
 
     def compute(shares):
         sizes.extend(len(trainings.active) for _, trainings in shares)
-        return [workers.score(setup, share) for share in reversed(shares)][::-1]
+        return [ray.score(setup, share) for share in reversed(shares)][::-1]
 
     remote = RemoteChunks(config, compute)
     local = Chunks(remote.bilevel)
     local.compile(1)
+    remote.compile(1)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))
     for _ in range(generations):
         state, info = local.advance(state, 1)
@@ -74,13 +76,13 @@ def make_room():
 
 def test_a_worker_imports_the_plugins_that_were_typed():
     config = sejax.config(["env=test_workers:make_room", *SOLVING[1:]])
-    assert len(workers._programs(json.dumps(config.plain()))) == 1
+    assert len(ray._programs(json.dumps(config.plain()))) == 1
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):
     versions = runtime.versions()
     monkeypatch.setattr(runtime, "versions", lambda: {"jax": "0.1"})
-    error = refusal(workers.call, versions, workers.score, (0, ()))
+    error = refusal(ray.call, versions, ray.score, (0, ()))
     assert error.field == "machines" and "0.1" in str(error)
 
 

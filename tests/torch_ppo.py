@@ -4,17 +4,7 @@ import jax
 import numpy as np
 import torch
 from support import raveled
-from test_ppo import (
-    CONFIG,
-    CONFIGS,
-    GOLDEN,
-    KEY,
-    KINDS,
-    MAX_ACTION,
-    STEPS,
-    ppo,
-    random_steps,
-)
+from test_ppo import CONFIG, CONFIGS, GOLDEN, KEY, KINDS, MAX_ACTION, STEPS, ppo, random_steps
 from torch_networks import TorchMLP, tensors, write_golden
 
 from sejax.agents.ppo import shuffled

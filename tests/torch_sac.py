@@ -8,15 +8,7 @@ import jax
 import numpy as np
 import torch
 from support import raveled
-from test_sac import (
-    ACTION_DIM,
-    CASES,
-    CHECKED_UPDATES,
-    GOLDEN,
-    case_batch,
-    case_noise,
-    state_of,
-)
+from test_sac import ACTION_DIM, CASES, CHECKED_UPDATES, GOLDEN, case_batch, case_noise, state_of
 from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from torch_networks import TorchMLP, follow, tensors, write_golden

@@ -19,12 +19,11 @@ from flax import struct
 from jaxtyping import Array, Float
 
 import sejax
-from sejax.agents.fixed import make_fixed
 from sejax.check import ARS
 from sejax.distillation.policy_search import Policy, SearchConfig, linear_act, make_search
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
-from sejax.evaluation import make_recorder, make_tester
+from sejax.evaluation import make_fixed, make_recorder, make_tester
 from sejax.proxies.base import ProxyEnv, ProxyParams
 
 Controller = Callable[[Array], Array]  # an observation [obs_dim] to an action

@@ -21,7 +21,8 @@ from experiments.common.experiment import Settings, setting
 from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, Count, require
-from sejax.runs import run_directory, session, workers
+from sejax.runs import run_directory, session
+from sejax.runs.chunks import Chunks, make_chunks
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
 QUICK = (
@@ -71,9 +72,7 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
     ]
 
 
-def learn(
-    configs: list[Any], option: str = "work", chunks: workers.Chunks | None = None
-) -> pd.DataFrame:
+def learn(configs: list[Any], option: str = "work", chunks: Chunks | None = None) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
     Args:
@@ -87,7 +86,7 @@ def learn(
     Raises:
       ConfigError: if a folder holds a run of other settings or of more generations, or is in use.
     """
-    chunks = chunks or workers.make_chunks(configs[0])
+    chunks = chunks or make_chunks(configs[0])
     curves = []
     for config in configs:
         with run_directory.RunDirectory(config, option) as directory:
@@ -156,7 +155,7 @@ def summarise(curves: pd.DataFrame, by: Sequence[str], solved_reward: float) -> 
 # --- what generations cost -----------------------------------------------------------------------
 
 
-def timed(chunks: workers.Chunks, path: Path) -> workers.Chunks:
+def timed(chunks: Chunks, path: Path) -> Chunks:
     """The same compiled generations, which write down their CPU seconds.
 
     CPU seconds are those of this process on all of its threads, while it computes a generation:

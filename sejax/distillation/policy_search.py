@@ -25,9 +25,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
 
-from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
-from sejax.evaluation import Steps, Tests, make_recorder, make_tester
+from sejax.evaluation import Steps, Tests, make_fixed, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
 from sejax.ops.scores import or_lowest_finite
 from sejax.options import Count, Finite, NonNegative, Options, Positive, require

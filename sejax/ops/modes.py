@@ -7,10 +7,7 @@ from sejax.options import as_text, require
 # For each mode: the allowed values, and why there are no others.
 MODES: dict[str, tuple[tuple[object, ...], str]] = {
     "jax_enable_x64": ((False,), "sejax computes in 32 bits"),
-    "jax_debug_nans": (
-        (False,),
-        "episodes that did not take place are nan, and a training may diverge",
-    ),
+    "jax_debug_nans": ((False,), "episodes that did not take place are nan"),
     "jax_debug_infs": ((False,), "the score before the first is minus infinity"),
     "jax_disable_jit": ((False,), "trainings are compiled as a whole"),
     "jax_debug_key_reuse": ((False,), "the state of a run that has ended keeps its key"),

@@ -14,7 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.runs.trackers.Tracker`
-`machines`    `sejax.machines`        `(config)`: see `sejax.runs.workers`
+`machines`    `sejax.machines`        `(config)`: see `sejax.runs.chunks`
 ============= ======================= ==============================================
 
 A name comes with sejax, is an entry point of an installed package, or is `module:attribute`, which
@@ -146,7 +146,7 @@ BUILT_IN = {
         "none": "sejax.runs.trackers:NoTracker",
         "tensorboard": "sejax.runs.trackers:TensorBoardConfig",
     },
-    "machines": {"local": "sejax.runs.workers:LocalConfig", "ray": "sejax.runs.workers:RayConfig"},
+    "machines": {"local": "sejax.runs.chunks:LocalConfig", "ray": "sejax.runs.ray:RayConfig"},
 }
 # Beginnings of names of tasks: a dataclass with a field `name` serves all names that begin so.
 PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask"}

@@ -16,14 +16,7 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import (
-    LARGEST,
-    ConfigError,
-    registry,
-    require,
-    require_known,
-    shortened,
-)
+from sejax.options import LARGEST, ConfigError, registry, require, require_known, shortened
 from sejax.options.plain import configure, expanded, from_plain
 from sejax.proxies import hub
 

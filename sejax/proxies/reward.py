@@ -187,8 +187,8 @@ class RewardEnv(ProxyEnv):
     ) -> RewardParams:
         """Params for the whole training of one agent, with its discount.
 
-        If states are discrete and all that the network sees, all potentials are computed at once, and
-        each step looks up two of them. They hold for these weights alone: call it again for other weights.
+        If the network sees a discrete state alone, all potentials are computed at once, and each
+        step looks up two of them. They hold for these weights alone: call it again for others.
 
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.

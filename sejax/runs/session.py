@@ -18,11 +18,11 @@ from sejax.bilevel import Bilevel, LearnState
 from sejax.ops.files import write_text
 from sejax.proxies.io import save
 from sejax.runs import plots, runtime
+from sejax.runs.chunks import Chunks
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration, GuardedTracker, TrackedRun
-from sejax.runs.workers import Chunks
 from sejax.scoring import GenerationInfo
 
 DRAW_EVERY_S = 30.0
@@ -30,10 +30,7 @@ PACKAGES = ("flax", "optax", "evosax", "gymnax", "numpy")
 
 
 def run(
-    config: LearnConfig,
-    directory: RunDirectory,
-    chunks: Chunks,
-    report: RunProgress | None = None,
+    config: LearnConfig, directory: RunDirectory, chunks: Chunks, report: RunProgress | None = None
 ) -> dict[str, Any]:
     """Runs Algorithm 1, or the rest of it, in chunks of `checkpoint_every` generations.
 

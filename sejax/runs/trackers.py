@@ -33,11 +33,6 @@ class TrackedRun:
     generation: int
     config: dict[str, Any]
 
-    @property
-    def picture(self) -> Path:
-        """The learning curve."""
-        return self.folder / "learning_curve.png"
-
 
 @dataclass(frozen=True, kw_only=True)
 class FinishedGeneration:

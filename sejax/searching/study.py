@@ -23,7 +23,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sejax.ops.files import require_writable, write_text
 from sejax.options import ConfigError, told
 from sejax.options.plain import parsed
-from sejax.runs import session, workers
+from sejax.runs import session
+from sejax.runs.chunks import make_chunks
 from sejax.runs.config import LearnConfig, layers_of
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
@@ -103,7 +104,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     Returns:
       A function that continues the runs up to a number of generations.
     """
-    chunks = workers.make_chunks(config)
+    chunks = make_chunks(config)
 
     def run(generations: int) -> Progress:
         means, summaries = [], []

@@ -1,16 +1,15 @@
-"""A run's compiled generations; and `machines=`: whether workers compute the trainings.
+"""`machines=ray`: workers on a Ray cluster compute the trainings of a run.
 
-With `machines=ray` this process, the driver, keeps the strategy, its state and all files. In each
-generation it sends shares of the candidates to workers on a Ray cluster, which return outcomes. An
-outcome depends only on its key and its candidate. So the numbers are those of a single process,
-whichever worker computes an outcome. A share is a task of Ray. Ray starts workers where cores are
-free, also on machines that join later, and sends a share again if its worker dies.
+This process, the driver, keeps the strategy, its state and all files. In each generation it sends
+shares of the candidates to workers, which return outcomes. An outcome depends only on its key and
+its candidate. So the numbers are those of a single process, whichever worker computes an outcome. A
+share is a task of Ray. Ray starts workers where cores are free, also on machines that join later,
+and sends a share again if its worker dies.
 """
 
 import contextlib
 import dataclasses
 import functools
-import itertools
 import json
 import os
 import socket
@@ -23,7 +22,6 @@ from typing import Any, ClassVar, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Trainings
@@ -32,77 +30,14 @@ from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import ConfigError, Count, FailedError, Options, require_package, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
+from sejax.runs.chunks import Chunks, Pool
 from sejax.runs.config import LearnConfig
 from sejax.scoring import GenerationInfo
 
 WorkShare: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
 BATCH = 16  # trainings in a share if neither the agent nor the user says how many
-Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
 RETRIES = 20  # how often Ray sends a share again if its worker dies
 LOOK_S = 1.0  # seconds between checks that the cluster still answers
-
-
-class Chunks:
-    """Chunks of generations of Algorithm 1; each length is compiled once, ahead of time.
-
-    `jax.jit` would compile again for a new state, a restored one, and one that a chunk returned,
-    because their placements differ.
-
-    Attributes:
-      bilevel: the functions of Algorithm 1.
-      cpu_s: CPU seconds of other processes.
-      compiled: the programs of chunks, by their lengths.
-    """
-
-    cpu_s = 0.0
-
-    def __init__(self, bilevel: Bilevel):
-        self.bilevel = bilevel
-        self.init: Callable[[Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
-        self.compiled: dict[int, Any] = {}
-
-    def compile(self, length: int) -> None:
-        """Compiles a chunk of this length."""
-
-        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-            step = self.bilevel.generation
-            return jax.lax.scan(lambda state, _: step(state), state, length=length)
-
-        state = jax.eval_shape(self.init, jax.random.key(0))
-        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self.compiled[length] = jitted.lower(state).compile()
-
-    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations, after `compile`; the buffers of the state are donated.
-
-        Returns:
-          The state, and an info with leaves `[length, ...]`.
-        """
-        state, info = self.compiled[length](state)
-        return state, info
-
-
-def make_chunks(config: LearnConfig) -> Chunks:
-    """The generations of a configuration; runs that differ in the seed may share them."""
-    return Chunks(make_bilevel(**config.parts()))
-
-
-# --- machines= ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocalConfig(Options):
-    """This process computes everything: one compiled program over its devices."""
-
-    group: ClassVar[str] = "machines"
-
-    def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
-        """The compiled generations of a run."""
-        return contextlib.nullcontext(make_chunks(config))
-
-    def pool(self) -> contextlib.AbstractContextManager[Pool]:
-        """Calls a function with each of several tuples of arguments, one after the other."""
-        return contextlib.nullcontext(itertools.starmap)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,9 +66,10 @@ class RayConfig(Options):
         Raises:
           ConfigError: if the cluster cannot be reached.
         """
-        # A worker needs this text, and keeps its compiled programs by it.
-        idle = "tracker", "machines"  # a worker need not have their packages
-        setup = json.dumps({name: x for name, x in config.plain().items() if name not in idle})
+        # A worker needs this text, and keeps its compiled programs by it. It need not have the
+        # packages of the two parts that are left out.
+        parts = config.plain().items()
+        setup = json.dumps({name: x for name, x in parts if name not in ("tracker", "machines")})
         with self.pool() as pool:
             yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
 
@@ -201,7 +137,7 @@ class RemoteChunks(Chunks):
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, which serve chunks of any length."""
-        self.compiled[length] = self._programs
+        self.compiled[length] = functools.partial(self._generations, *self._programs, length)
 
     @functools.cached_property
     def _programs(self) -> tuple[Any, list[Outcome]]:
@@ -229,16 +165,10 @@ class RemoteChunks(Chunks):
         jitted = jax.jit(generation, compiler_options=compiler_options())
         return jitted.lower(state, no_outcomes).compile(), no_outcomes
 
-    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations.
-
-        Returns:
-          The state, and an info with leaves `[length, ...]`.
-
-        Raises:
-          FailedError: if a worker fails, or the whole cluster is lost.
-        """
-        generation, no_outcomes = self._programs
+    def _generations(
+        self, generation: Any, no_outcomes: list[Outcome], length: int, state: LearnState
+    ) -> tuple[LearnState, GenerationInfo]:
+        """Runs `length` generations with the compiled programs."""
         infos = []
         for _ in range(length):
             _, trainings = generation(state, no_outcomes)

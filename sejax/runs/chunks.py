@@ -1,0 +1,78 @@
+"""A run's compiled generations; `sejax.runs.ray` has those that a cluster computes."""
+
+import contextlib
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+import jax
+from jax import Array
+
+from sejax.bilevel import Bilevel, LearnState, make_bilevel
+from sejax.ops.parallel import compiler_options
+from sejax.options import Options
+from sejax.runs.config import LearnConfig
+from sejax.scoring import GenerationInfo
+
+Chunk: TypeAlias = Callable[[LearnState], tuple[LearnState, GenerationInfo]]
+Pool: TypeAlias = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Any]
+
+
+class Chunks:
+    """Chunks of generations of Algorithm 1; each length is compiled once, ahead of time.
+
+    `jax.jit` would compile again for a new state, a restored one, and one that a chunk returned,
+    because their placements differ.
+
+    Attributes:
+      bilevel: the functions of Algorithm 1.
+      cpu_s: CPU seconds of other processes.
+      compiled: the programs of chunks, by their lengths.
+    """
+
+    cpu_s = 0.0
+
+    def __init__(self, bilevel: Bilevel):
+        self.bilevel = bilevel
+        self.init: Callable[[Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
+        self.compiled: dict[int, Chunk] = {}
+
+    def compile(self, length: int) -> None:
+        """Compiles a chunk of this length."""
+        chunk = functools.partial(self.bilevel.generations, length=length)
+        state = jax.eval_shape(self.init, jax.random.key(0))
+        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
+        self.compiled[length] = jitted.lower(state).compile()
+
+    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
+        """Runs `length` generations, after `compile`; the buffers of the state are donated.
+
+        Returns:
+          The state, and an info with leaves `[length, ...]`.
+
+        Raises:
+          FailedError: if workers compute the trainings, and one fails or the cluster is lost.
+        """
+        return self.compiled[length](state)
+
+
+def make_chunks(config: LearnConfig) -> Chunks:
+    """The generations of a configuration; runs that differ in the seed may share them."""
+    return Chunks(make_bilevel(**config.parts()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalConfig(Options):
+    """This process computes everything: one compiled program over its devices."""
+
+    group: ClassVar[str] = "machines"
+
+    def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
+        """The compiled generations of a run."""
+        return contextlib.nullcontext(make_chunks(config))
+
+    def pool(self) -> contextlib.AbstractContextManager[Pool]:
+        """Calls a function with each of several tuples of arguments, one after the other."""
+        return contextlib.nullcontext(itertools.starmap)
