@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent
-from sejax.es.base import Groups, StrategyState
+from sejax.es.base import PerGroup, StrategyState
 from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import Outcome
 from sejax.ops.parallel import spread_groups_over_devices
@@ -27,7 +27,7 @@ class Candidates:
 
     population: Float[Array, "pop dims"]
     incumbent: Float[Array, " dims"]
-    keys: Groups[Array]  # of the trainings
+    keys: PerGroup[Array]  # of the trainings
     active: Array  # whether anything is to be computed
     test_params: PyTree  # of `Objective.test_env`; None for the task's
     key_tell: Array
@@ -63,9 +63,9 @@ class GenerationEvaluator:
 
     Attributes:
       devices: as given.
-      runs: for each agent, `(training) -> Outcome`, for one of its `Trainings`.
+      evaluators: for each agent, `(training) -> Outcome`, for one of its `Trainings`.
       widths: for each agent, the trainings in a vmapped batch on a CPU core; None for all.
-      sizes: for each agent, the number of trainings in a generation.
+      num_trainings: for each agent, the number of trainings in a generation.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
@@ -84,7 +84,7 @@ class GenerationEvaluator:
         agents, objective = scoring.mixture.agents, scoring.objective
         training = tested_throughout(training) if objective.needs_tests else training
 
-        def run_with(agent: Agent) -> Callable[[Trainings], Outcome]:
+        def evaluator_of(agent: Agent) -> Callable[[Trainings], Outcome]:
             worlds = proxy, proxy.task, training, objective.test_env
             evaluate = make_evaluator(agent, *worlds, in_batches=False)
 
@@ -94,11 +94,13 @@ class GenerationEvaluator:
 
             return run
 
-        self.runs = [run_with(agent) for agent in agents]
+        self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.sizes = [scoring.trainings_of(i).size for i in range(len(agents))]
+        self.num_trainings = [scoring.trainings_of(i).size for i in range(len(agents))]
         self._scoring = scoring
-        self._spread = spread_groups_over_devices(self.runs, devices, num_parallel, self.widths)
+        self._spread = spread_groups_over_devices(
+            self.evaluators, devices, num_parallel, self.widths
+        )
 
     def __call__(self, candidates: Candidates) -> Outcome:
         return self.joined(self._spread([(of_agent,) for of_agent in self.trainings(candidates)]))
@@ -108,17 +110,16 @@ class GenerationEvaluator:
         keys, shared = candidates.keys, (candidates.active, candidates.test_params)
         by_agent = []
         num_evals = self._scoring.evaluations.num_evals
-        pairs = zip(self._scoring.candidates, self.sizes, strict=True)
+        pairs = zip(self._scoring.candidates, self.num_trainings, strict=True)
         for agent_index, (numbers, size) in enumerate(pairs):
             population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
             incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
+            of_agent = keys.population[numbers].ravel(), keys.incumbent[:, agent_index]
             trainings = Trainings(
-                key=jnp.concatenate(
-                    [keys.population[numbers].ravel(), keys.incumbent[:, agent_index]]
-                ),
+                key=jnp.concatenate(of_agent),
                 candidate=jnp.concatenate([population, incumbent]),
                 active=active,
                 test_params=test_params,

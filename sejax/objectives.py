@@ -81,7 +81,7 @@ class Objective:
         """Scores; nan for trainings that diverged."""
         return jnp.where(outcome.nonfinite, jnp.nan, self.score(outcome))
 
-    def judged(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def shown_score(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
         return jnp.where(outcome.nonfinite, jnp.nan, (self.shown or self.score)(outcome))
 

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Shaped
 
 from sejax.agents.mixture import Mixture
-from sejax.es.base import Evaluations, Groups, Strategy
+from sejax.es.base import Evaluations, PerGroup, Strategy
 from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
 from sejax.options import require
@@ -124,9 +124,9 @@ class Scoring:
         population = self.evaluations.population_scores(by_candidate)
         return self.mixture.comparable(population, self.candidates, scores.agent_means)
 
-    def judged(self, outcome: Outcome) -> Scores:
+    def for_people(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
-        return self._scores(self.objective.judged(outcome))
+        return self._scores(self.objective.shown_score(outcome))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
@@ -181,12 +181,12 @@ class Scoring:
         """Trainings on the population."""
         return sum(numbers.size for numbers in self.candidates) * self.evaluations.num_evals
 
-    def _numbers(self, agent_index: int) -> Groups[np.ndarray]:
+    def _numbers(self, agent_index: int) -> PerGroup[np.ndarray]:
         """The numbers of an agent's trainings within each group."""
         num_evals, num_agents = self.evaluations.num_evals, self.mixture.size
         of_population = np.add.outer(self.candidates[agent_index] * num_evals, np.arange(num_evals))
         of_incumbent = np.arange(agent_index, self.evaluations.num_incumbent_evals, num_agents)
-        return Groups(of_population.ravel(), of_incumbent)
+        return PerGroup(of_population.ravel(), of_incumbent)
 
     def _by_agent(
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]

@@ -108,7 +108,7 @@ def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
 def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     program, _, ((states, infos), (others, _)) = one_device
     assert len({float(info.population_mean) for info in infos}) == 3
-    assert sum(program.evaluate.sizes) == 12  # 4 members with two signs, 4 incumbents
+    assert sum(program.evaluate.num_trainings) == 12  # 4 members with two signs, 4 incumbents
     groups = [
         keys for state in (states[0], states[1], others[0]) for keys in program.ask(state).keys
     ]
@@ -122,7 +122,7 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     state = program.init(KEYS[0])
     candidates = program.ask(state)
     assert candidates.test_params.scored_steps == 1 < program.proxy.task.max_steps
-    (trainings,), (run,) = program.evaluate.trainings(candidates), program.evaluate.runs
+    (trainings,), (run,) = program.evaluate.trainings(candidates), program.evaluate.evaluators
     of_vectors = dataclasses.replace(candidates, test_params=jnp.arange(2))  # a leaf may have axes
     (repeated,) = program.evaluate.trainings(of_vectors)
     np.testing.assert_array_equal(repeated.test_params, [[0, 1]] * len(trainings.candidate))
@@ -244,5 +244,5 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     strategy = program.strategy
     num_population = strategy.population_size * strategy.evaluations.num_evals
     assert info.population_scores.shape == (num_population,)
-    assert info.train_steps.shape == info.real_steps.shape == (sum(program.evaluate.sizes),)
+    assert info.train_steps.shape == info.real_steps.shape == (sum(program.evaluate.num_trainings),)
     assert info.incumbent_mean.shape == ()

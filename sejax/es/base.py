@@ -22,7 +22,7 @@ T = TypeVar("T")
 StrategyState: TypeAlias = PyTree  # only the strategy reads it
 
 
-class Groups(NamedTuple, Generic[T]):
+class PerGroup(NamedTuple, Generic[T]):
     """Values for the two groups of trainings in a generation.
 
     Attributes:
@@ -51,7 +51,7 @@ class Evaluations:
     num_incumbent_evals: int = 16
     common_random_numbers: bool = False
 
-    def keys(self, key: Array, population_size: int, num_agents: int = 1) -> Groups[Array]:
+    def keys(self, key: Array, population_size: int, num_agents: int = 1) -> PerGroup[Array]:
         """A key for each training of a generation.
 
         Args:
@@ -66,7 +66,7 @@ class Evaluations:
         else:
             of_incumbent = of_incumbent + of_population.size
         fold_in = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (None, 0))
-        return Groups(
+        return PerGroup(
             population=fold_in(key, of_population.reshape(population_size, self.num_evals)),
             incumbent=fold_in(key, of_incumbent.reshape(-1, num_agents)),
         )

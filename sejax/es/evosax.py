@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
+from sejax.es.base import (
+    Evaluations,
+    NumMembers,
+    Scale,
+    Strategy,
+    StrategyOptions,
+    StrategyState,
+)
 from sejax.options import Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second

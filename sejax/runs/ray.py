@@ -156,7 +156,7 @@ class RemoteChunks(Chunks):
 
         def evaluate(state: LearnState) -> list[Outcome]:
             trainings = bilevel.evaluate.trainings(bilevel.ask(state))
-            pairs = zip(bilevel.evaluate.runs, trainings, strict=True)
+            pairs = zip(bilevel.evaluate.evaluators, trainings, strict=True)
             return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
 
         state = jax.eval_shape(bilevel.init, jax.random.key(0))
@@ -262,7 +262,7 @@ def _programs(setup: str) -> list[tuple[int, Any]]:
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
     def program_of(agent_index: int, size: int) -> Any:
-        spread = spread_over_devices(bilevel.evaluate.runs[agent_index], 1, size)
+        spread = spread_over_devices(bilevel.evaluate.evaluators[agent_index], 1, size)
 
         def evaluate(sent: Trainings) -> Outcome:
             key = jax.random.wrap_key_data(sent.key)

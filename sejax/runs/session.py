@@ -77,7 +77,7 @@ def run(
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
     ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
-    generations, agents = len(directory.rows), sum(bilevel.evaluate.sizes)
+    generations, agents = len(directory.rows), sum(bilevel.evaluate.num_trainings)
     summary_file = directory.folder / "run.json"
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # none, or damaged
         stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
@@ -136,7 +136,7 @@ def _advance(
 
 def _all_diverged(directory: RunDirectory, bilevel: Bilevel) -> bool:
     """Whether every agent of every generation has diverged; False before the first generation."""
-    rows, agents = directory.rows, sum(bilevel.evaluate.sizes)
+    rows, agents = directory.rows, sum(bilevel.evaluate.num_trainings)
     return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
