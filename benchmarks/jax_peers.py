@@ -154,7 +154,10 @@ def serve(side: str, args: argparse.Namespace) -> None:
 
 
 def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
-    """The task, and the environment with its parameters: the task's own, or a fresh SE's."""
+    """The task, and the environment with its parameters: the task's own, or an SE's.
+
+    The SE with ordinary episodes that ships for CartPole; for Pendulum one of random weights.
+    """
     import jax
 
     import sejax
@@ -162,6 +165,9 @@ def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
     task = sejax.envs.make(task_name)
     if world == "task":
         return task, task.env, task.params
+    if task_name == "cartpole":
+        env, params = sejax.load("cartpole-episodic")
+        return env.task, env, params
     env = sejax.SyntheticConfig(initial_state="real", horizon=None, done="soft").make(task)
     return task, env, env.params(env.init_weights(jax.random.key(0)))
 

@@ -25,7 +25,8 @@ class Scores:
     """Scores of a generation.
 
     Attributes:
-      population: one for each training, candidate by candidate; nan for agents that diverged.
+      population: one for each training, candidate by candidate; not finite for agents that
+        diverged.
       incumbent: one for each training, `[turn, agent]` flattened; agents that diverged rank last.
       agent_means: the incumbent's mean with each agent of a mixture; nan if all of them diverged.
       incumbent_mean: the incumbent's score; nan if all trainings with one of the agents diverged.
@@ -132,12 +133,13 @@ class Scoring:
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
     ) -> GenerationInfo:
         """The statistics of a generation."""
+        finite_or_nan = jnp.where(jnp.isfinite(scores.population), scores.population, jnp.nan)
         return GenerationInfo(
             generation=generation,
             incumbent_mean=scores.incumbent_mean,
             incumbent_std=jnp.nanstd(scores.incumbent),
             population_mean=finite_mean(scores.population),
-            population_max=jnp.nanmax(scores.population),
+            population_max=jnp.nanmax(finite_or_nan),
             best_so_far=best,
             train_steps_mean=outcome.train_steps.mean(),
             train_steps_max=outcome.train_steps.max(),
@@ -156,7 +158,6 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
         population, incumbent = jnp.split(scores, [self._num_population])
         means = []
         for agent_index in range(self.mixture.size):
