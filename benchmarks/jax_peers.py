@@ -30,6 +30,7 @@ PPO_STEPS = 128 * 16
 SIDES = ("sejax", "rejax")
 MODES = ("map", "vmap")
 HEAD = ["agent, units, task", "world", "agents", *SIDES, "rejax / sejax", "vmap / map of sejax"]
+SES = {"cartpole": "cartpole-episodic", "pendulum": "pendulum"}
 GYMNAX_NAMES = {"cartpole": "CartPole-v1", "pendulum": "Pendulum-v1"}
 
 
@@ -154,22 +155,14 @@ def serve(side: str, args: argparse.Namespace) -> None:
 
 
 def world_of(task_name: str, world: str) -> tuple[Any, Any, Any]:
-    """The task, and the environment with its parameters: the task's own, or an SE's.
-
-    The SE with ordinary episodes that ships for CartPole; for Pendulum one of random weights.
-    """
-    import jax
-
+    """The task, and the environment with its parameters: the task's own, or the shipped SE's."""
     import sejax
 
-    task = sejax.envs.make(task_name)
     if world == "task":
+        task = sejax.envs.make(task_name)
         return task, task.env, task.params
-    if task_name == "cartpole":
-        env, params = sejax.load("cartpole-episodic")
-        return env.task, env, params
-    env = sejax.SyntheticConfig(initial_state="real", horizon=None, done="soft").make(task)
-    return task, env, env.params(env.init_weights(jax.random.key(0)))
+    env, params = sejax.load(SES[task_name])
+    return env.task, env, params
 
 
 def sejax_trainer(algorithm: str, width: int, task_name: str, world: str, steps: int) -> Any:

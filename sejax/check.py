@@ -10,6 +10,7 @@
   network (RN), the same agents without it, and tuned agents.
 - Cost: how many agents must train on it to save the real steps that learning it took.
 
+Hyperparameters are fixed, also if it was learned with random ones.
 Writes check.json and check.png into out_dir. The same command resumes where it stopped.
 """
 
@@ -118,6 +119,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
 def run(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
+    require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
     proxy, learned = loaded(config), dict[str, Any](config.agents)
     task = proxy.task
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
@@ -136,7 +138,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
         }
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
     config = dataclasses.replace(config, agents=students)
-    on_proxy, on_task = setup_of(config)[0].values()
+    on_proxy, on_task = (x._replace(is_varied=False) for x in setup_of(config)[0].values())
     folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
     settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}

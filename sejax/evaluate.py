@@ -69,7 +69,8 @@ class EvaluateConfig(CommandConfig):
       training_from: How long agents train on the proxy. proxy: on an SE as in the run that learned
         it, on a reward network as on the real task; config: as `training` says.
       baseline: whether as many agents train on the real task, for comparison
-      out_dir: null: beside the proxy (runs/evaluate-<name> if the proxy has no folder)
+      out_dir: null: beside the proxy; of a sweep, and if the proxy has no folder,
+        runs/evaluate-<proxy>
       real_training: Training on the real task. Its test_episodes hold on the proxy too, unless
         training_from=config. Agents as_learned keep the time_limit_is_terminal of the run.
     """
@@ -168,7 +169,11 @@ def help_text(overrides: Sequence[str]) -> str:
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     make = functools.partial(configuration.config, command=EvaluateConfig)
-    return compose.swept(overrides, make, "out_dir", lambda _, name: f"runs/evaluate-{name}")
+
+    def folder_of(config: EvaluateConfig, name: str) -> str:
+        return f"runs/evaluate-{as_file_name(config.proxy)}_{name}"
+
+    return compose.swept(overrides, make, "out_dir", folder_of, known=("proxy",))
 
 
 def evaluate(config: EvaluateConfig) -> float:

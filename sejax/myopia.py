@@ -56,7 +56,7 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
 
     - dynamics: the far-sighted agents score better by more than the margin;
     - policy: by less than the margin, and they score above the floor by more than the margin;
-    - teaches little: they score above the floor by less than the margin;
+    - teaches little: they score above the floor by less than the margin, or the floor is the top;
     - open: an interval contains the margin.
 
     Args:
@@ -73,12 +73,12 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     margin = MARGIN * (top - floor.mean())
     lost, gained = far - myopic, far - floor
     (low, high), (gain_low, gain_high) = mean_interval(lost), mean_interval(gained)
-    if low > margin:
+    if low > margin > 0:
         verdict = "dynamics"
     elif high < margin < gain_low:
         verdict = "policy"
     else:
-        verdict = "teaches little" if gain_high < margin else "open"
+        verdict = "teaches little" if gain_high < margin or margin <= 0 else "open"
     halves = np.array([high - low, gain_high - gain_low]) / 2
     distances = np.abs([lost.mean() - margin, gained.mean() - margin])
     # The width of an interval falls with the square root of the number of agents.

@@ -60,6 +60,7 @@ def test_as_many_more_agents_decide_as_are_said():
     """Of the same spread: the interval's width falls with the root of their number."""
     myopic, far = np.tile([0.0, 100.0], 10), np.full(20, 100.0)
     few = judge(myopic, far, 0.0, 100.0)
+    assert judge(far, far, 110.0, 100.0).verdict == "teaches little"  # untrained agents solve it
     assert few.verdict == "dynamics"
     near = judge(np.tile([70.0, 100.0], 10), far, 0.0, 100.0)  # loses 15, the margin is 10
     assert near.verdict == "open"
@@ -142,6 +143,15 @@ def test_what_cannot_be_judged_is_refused(fields, field, whole, tmp_path, monkey
     monkeypatch.setattr(checking, "_trained", refuse)
     assert refused(run, whole[0] / "mine.safetensors", out_dir=tmp_path / "out", **fields) == field
     assert not (tmp_path / "out").exists()
+
+
+def test_no_agents_have_random_hyperparameters(tmp_path, monkeypatch):
+    """A discount of 0 would be drawn again, and rows would compare different agents."""
+    rows = []
+    monkeypatch.setattr(checking, "_trained", lambda config, of_check, store: rows.append(of_check))
+    monkeypatch.setattr(checking, "_reported", lambda *_: {})
+    run(save(tmp_path / "x.safetensors", *WHOLE, "agent_hparams=varied"), out_dir=tmp_path / "out")
+    assert rows[0] and not any(world.is_varied for world, _ in rows[0].values())
 
 
 def test_damaged_files_and_tasks_that_are_not_here_are_refused(whole, tmp_path, monkeypatch):

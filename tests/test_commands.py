@@ -126,3 +126,8 @@ def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):
     assert expanded("sqlite:///~/a.db") == "sqlite:////home/me/a.db"
     for text in ("a~", "~me/a", "/a/~/b", "a:b"):
         assert expanded(text) == text
+
+
+def test_there_are_as_many_devices_as_any_run_of_a_sweep_needs():
+    lines = ["devices=1,2"], ["devices=x"], [], ["devices=3", "machines=ray"]
+    assert [commands._devices(words) for words in lines] == [2, None, None, 1]

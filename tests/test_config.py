@@ -146,8 +146,8 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
     assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
-    configs = evaluate.configs_of(["proxy=cartpole", "seed=1,2"])
-    assert [x.out_dir for x in configs] == ["runs/evaluate-seed_1", "runs/evaluate-seed_2"]
+    folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
+    assert folders[1] == "runs/evaluate-cartpole_seed_2" and len({*folders}) == 4
 
 
 # --- preset files ---------------------------------------------------------------------------------
@@ -319,6 +319,8 @@ def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
         sejax.config(["env=acrobot", "es=cma_es"])
         slow = {"gymnax.registration", "evosax", "torch", "brax", "pandas", "matplotlib"}
         assert not slow & set(sys.modules), slow & set(sys.modules)
+        import sejax.check
+        assert "matplotlib.pyplot" not in sys.modules  # it would choose how pictures are shown
         from jax._src import xla_bridge
         assert not xla_bridge.backends_are_initialized()
     """

@@ -152,6 +152,7 @@ def unknown(task, scale=2.0) -> "Unknown | Objective":
     return scaled(task, scale)
 
 wrong = lambda task: 3
+named = lambda task, name="pole": 3
 too_few = lambda: 3
 of_any = lambda task, *values, **more: 3
 
@@ -197,6 +198,7 @@ def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     ("Scaled", {}, "objective.needed"), ("scaled", {"scale": "x"}, "objective.scale"),
     ("scaled", {"scal": 1}, "objective.scale"), ("a_number", {}, "a dataclass with make(task)"),
     ("Plain", {}, "a dataclass with make(task)"), ("Outer", {}, "a dataclass with make(task)"),
+    ("named", {}, "must take (task, option=default, ...)"),
     ("too_few", {}, "must take (task, option=default, ...)"),
     ("Vague", {"scale": 2}, "'Unknown' is not defined"), ("a_number.nope", {}, "'nope'"),
     ("of_any", {}, "must take (task, option=default, ...)"),

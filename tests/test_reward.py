@@ -204,16 +204,16 @@ def test_prepared_params_look_up_what_the_network_says():
 
 
 def test_an_augmented_network_sees_a_discrete_state_and_its_info():
-    """The potential in NumPy; agents of whole trainings too, whose params are prepared."""
+    """Also if its params are prepared for a training."""
 
     class Lit(Wrapper):
         def step_env(self, key, state, action, params):
             *stepped, info = self.env.step_env(key, state, action, params)
             return *stepped, info | {"light": jnp.float32(stepped[0] % 3)}
 
-    keys = {"info_keys": ("light",), "augmented_keys": ("light",)}
-    walk = envs.make("cliff_walking")
-    task = sejax.Task(name="lit", env=Lit(walk.env), max_steps=50, solved_reward=-20, **keys)
+    keys, walk = ("light",), envs.make("cliff_walking")
+    lit = {"env": Lit(walk.env), "info_keys": keys, "augmented_keys": keys, "origin": None}
+    task = dataclasses.replace(walk, **lit)
     env = RewardConfig(variant="exclusive_potential", augmented=True, hidden_size=5).make(task)
     params = env.prepare(env.params(env.init_weights(KEY)), GAMMA)
     obs, state = env.reset_env(KEY, params)
@@ -224,9 +224,6 @@ def test_an_augmented_network_sees_a_discrete_state_and_its_info():
         weights = params.weights["potential"]
         before, after = (numpy_forward(weights, x, "prelu", 1)[0] for x in seen[-2:])
         np.testing.assert_allclose(reward, GAMMA * after - before, rtol=1e-4, atol=1e-6)
-    agent = make_agent(QLearningConfig(), task)
-    result = make_trainer(agent, env, TrainingConfig(max_episodes=3, max_steps=150))(KEY, params)
-    assert result.episodes == 3 and not result.nonfinite
 
 
 LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2",

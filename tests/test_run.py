@@ -362,6 +362,9 @@ def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, m
         assert summary["ended"] == "diverged"
         (tmp_path / "run" / "run.json").write_text(json.dumps(summary | {"machine": "mine"}))
     assert summary["machine"] == "mine"  # of the one that computed it
+    (tmp_path / "run" / "run.json").write_text(json.dumps(summary | {"real_steps": 0}))
+    ended(monkeypatch, capsys, START, *words)  # and not of another run
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["real_steps"] > 0
     sweep = [*TINY, "env=my_broken:make", "env.reward=nan,1.0", "generations=1", "run_dir=sweep"]
     status, _, err = ended(monkeypatch, capsys, START, *sweep)
     assert status == commands.FAILED and "All agents of sweep/env.reward_nan diverged" in err

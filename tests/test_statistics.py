@@ -18,8 +18,7 @@ def test_intervals_are_those_of_scipys_t_tests(size):
 
 
 def test_fewer_than_five_values_have_no_interval():
-    four = [1.0, 2.0, 3.0, 4.0]
-    assert np.isnan([mean_interval(four), difference_interval(four, [1.0] * 9)]).all()
+    assert np.isnan([mean_interval(range(4)), difference_interval(range(4), [1.0] * 9)]).all()
 
 
 def test_the_worst_tenth_is_the_mean_of_the_lowest_values():

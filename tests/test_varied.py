@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_close, random_columns, raveled, shapes_of
+from support import assert_close, random_columns, raveled, refused, shapes_of
 
 import sejax
 from sejax import envs
-from sejax.agents import make_agent
+from sejax.agents import AgentOptions, make_agent
 from sejax.agents.base import drawing_key
 from sejax.agents.buffers import Transition, block_size, sum_over_batch
 from sejax.agents.dqn import DDQN, DDQNConfig
@@ -18,6 +18,7 @@ from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.ops.networks import MLP, narrow
+from sejax.options import option
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
@@ -38,6 +39,9 @@ def test_ranges_around_the_default_agent_are_the_papers():
     assert ranges_of(DDQNConfig())["num_layers"] == (1, 2, False, True)
     tabular = ranges_of(QLearningConfig())
     assert tabular == dict.fromkeys(("learning_rate", "discount"), (0.1, 1.0, False, False))
+    wide = {"hidden_size": option(8, varied="triple"), "__annotations__": {"hidden_size": int}}
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(type("Wide", (AgentOptions,), wide))
+    assert refused(ranges_of, cls()) == "agent_hparams"
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name as canonical
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
@@ -16,10 +17,6 @@ def pins(name):
     lines = [re.sub(r"\s*#.*", "", line) for line in (ROOT / name).read_text().splitlines()]
     pairs = [line.split("==") for line in lines if line]
     return {canonical(package): Version(version) for package, version in pairs}
-
-
-def canonical(package):
-    return re.sub(r"[-_.]+", "-", package).lower()
 
 
 def test_the_lowest_constraints_are_the_lower_bounds_of_what_is_required():

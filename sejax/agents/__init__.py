@@ -106,9 +106,7 @@ def require_fit(
     """
     if not _fits(agent, spec):
         known, got = fitting(spec), shortened(registry.name_of("agent", agent))
-        must = (
-            f"{field} must be one of {', '.join(known)} in {task_name}, with {spec.states} states"
-        )
+        must = f"{field} must be one of {', '.join(known)} in {task_name} with {spec.states} states"
         message = f"{must} and {spec.actions} actions; got {got}. Set agent={known[0]}."
         raise ConfigError(message, field)
     if exploration.states is not None and agent.states not in (None, exploration.states):

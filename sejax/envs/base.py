@@ -143,11 +143,8 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
     wanted, got = map(types, jax.eval_shape(step, jax.random.key(0)))
-    faults = [
-        f"{key} is {got.get(key)}, not {wanted.get(key)}"
-        for key in wanted | got
-        if wanted.get(key) != got.get(key)
-    ]
+    keys = [x for x in wanted | got if wanted.get(x) != got.get(x)]
+    faults = [f"{x} is {got.get(x)}, not {wanted.get(x)}" for x in keys]
     got_faults = f"got {name}, where {options.shortened('; '.join(faults), 120)}"
     fix = "Cast in reset_env and step_env what differs"
     options.require(not faults, "env", f"must keep its shapes; {got_faults}. {fix}.")

@@ -18,12 +18,7 @@ from sejax.envs.spec import Discrete, TaskSpec
 from sejax.options import Finite, Options
 
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
-CLIFF_WALKING = (
-    "            ",
-    "            ",
-    "            ",
-    "SOOOOOOOOOOG",
-)
+CLIFF_WALKING = (*[" " * 12] * 3, "SOOOOOOOOOOG")
 ROOM_2X2 = ("S ", " G")
 
 

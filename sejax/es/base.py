@@ -43,7 +43,8 @@ class Evaluations:
       num_evals: evaluations for each candidate of the population.
       aggregate: how the scores of a candidate's evaluations become one score: mean or min.
       num_incumbent_evals: evaluations of the incumbent.
-      common_random_numbers: whether the r-th evaluation of every candidate has the same seed.
+      common_random_numbers: whether the r-th evaluation of every candidate has the same seed, the
+        incumbent's with each agent too.
     """
 
     num_evals: int = 1
@@ -63,6 +64,7 @@ class Evaluations:
         of_incumbent = np.arange(self.num_incumbent_evals)
         if self.common_random_numbers:
             of_population = of_population % self.num_evals
+            of_incumbent = of_incumbent // num_agents
         else:
             of_incumbent = of_incumbent + of_population.size
         fold_in = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (None, 0))

@@ -36,7 +36,6 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_c
 
 from sejax.options import ConfigError, Options, place_of, require, shortened, told, unknown_name
 
-PASS_AN_OBJECT = "Pass an object; sejax.config([...]) takes names."
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
@@ -275,14 +274,16 @@ def is_hashable(config: object) -> bool:
     return True
 
 
-def require_part(group: str, cls: type[T], part: object, fix: str = PASS_AN_OBJECT) -> T:
+def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
     """The part, if it is one of this class.
 
     Raises:
       ConfigError: for anything else.
     """
-    got = shortened(repr(part))
-    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; got {got}. {fix}")
+    got = (
+        f"got {shortened(repr(part))}. {fix or 'Pass an object; sejax.config([...]) takes names.'}"
+    )
+    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; {got}")
     return cast(T, part)
 
 
@@ -341,11 +342,12 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass for a function: its fields are the parameters after the group's arguments."""
     arguments, signature = GROUPS[group].arguments, inspect.signature(function)
     parameters = list(signature.parameters.values())
+    options = parameters[len(arguments) :]
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
     must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got"
     is_fit = len(parameters) >= len(arguments) and not is_open
+    is_fit &= all(p.name != "name" for p in options)  # which is the choice's own
     require(is_fit, group, f"{must} {shortened(f'{name}{signature}')}.")
-    options = parameters[len(arguments) :]
 
     def make(self: object, *parts: object) -> Any:
         return function(*parts, **{p.name: getattr(self, p.name) for p in options})

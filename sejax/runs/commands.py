@@ -68,12 +68,13 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _devices(overrides: Sequence[str]) -> int | None:
-    """The value of `devices=`, if it is a number; 1 if other machines compute the trainings."""
+    """The largest number of `devices=`; 1 if other machines compute the trainings."""
     with contextlib.suppress(ConfigError):  # the command raises it later
-        tree = compose.read(compose.expand(overrides)[0], ["machines"])
-        is_here = tree.get("machines", {}).get("name", "local") == "local"
-        count = str(tree.get("devices", "")) if is_here else "1"
-        return int(count) if re.fullmatch(r"[1-9]\d{0,3}", count) else None
+        trees = [compose.read(words, ["machines"]) for words in compose.expand(overrides)]
+        is_here = trees[0].get("machines", {}).get("name", "local") == "local"
+        counts = [str(tree.get("devices", "")) if is_here else "1" for tree in trees]
+        are_counts = all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts)
+        return max(map(int, counts)) if are_counts else None
     return None
 
 

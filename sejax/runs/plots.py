@@ -5,9 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -34,10 +31,9 @@ def learning_curve(
     agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
     steps = {name: y for name, y in data.items() if name.startswith("train_steps_mean")}
     lines = 1 + any(map(np.ptp, steps.values()))
-    with plt.rc_context(STYLE):
-        figure, _ = plt.subplots(
-            lines, figsize=(7, 2.5 + 1.5 * lines), sharex=True, height_ratios=(2, 1)[:lines]
-        )
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7, 2.5 + 1.5 * lines))
+        figure.subplots(lines, sharex=True, height_ratios=(2, 1)[:lines])
         top, bottom = figure.axes[0], figure.axes[-1]
         label = "search mean: mean and std over fresh agents"
         top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
@@ -74,8 +70,9 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
     """
     rows, rng = list(table["world"].unique()), np.random.default_rng(0)
     kinds = list(dict.fromkeys(name.partition("-")[0] for name in table["agent"]))
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(8, 1.5 + 0.8 * len(rows)))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8, 1.5 + 0.8 * len(rows)))
+        axis = figure.subplots()
         for y, row in enumerate(rows):
             parts = list(table[table["world"] == row].groupby("agent", sort=False)["test_return"])
             for i, (name, returns) in enumerate(parts):
@@ -96,4 +93,3 @@ def _write(figure: Figure, path: Path) -> None:
     figure.set_layout_engine("constrained")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)
-    plt.close(figure)

@@ -78,22 +78,24 @@ def run(
         draw(config, directory, bilevel)
     ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
     generations, agents = len(directory.rows), sum(bilevel.evaluate.num_trainings)
-    summary_file = directory.folder / "run.json"
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # none, or damaged
-        stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
-        if (stored["generations"], stored["ended"]) == (generations, ended):
-            return stored  # which names the machine that computed it
-    versions = runtime.versions() | {package: version(package) for package in PACKAGES}
-    summary = {
+    counts = {
         "ended": ended,
         "best_score": float(state.best_score) if state.best_generation >= 0 else None,
         "solved_score": bilevel.solved_score,
-        "wall_s": round(start_wall_s + time.monotonic(), 1),
-        "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
         "generations": generations,
         "agents": generations * agents,
         "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
         "real_steps": int(directory.last("env_steps_total")),
+    }
+    summary_file = directory.folder / "run.json"
+    with contextlib.suppress(OSError, ValueError, TypeError):  # none, or damaged
+        stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
+        if stored | counts == stored:
+            return stored  # which names the machine that computed it
+    versions = runtime.versions() | {package: version(package) for package in PACKAGES}
+    summary = counts | {
+        "wall_s": round(start_wall_s + time.monotonic(), 1),
+        "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
         "devices": [str(device) for device in jax.devices()],
         "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
         "versions": {"python": platform.python_version()} | versions,
