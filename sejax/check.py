@@ -35,7 +35,7 @@ from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted
 from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
-from sejax.myopia import LEAST, judge, verdict_of
+from sejax.myopia import ENOUGH, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import LARGEST, Count, as_text, registry, require
 from sejax.options.plain import configure, plugin
@@ -76,7 +76,7 @@ class CheckConfig(EvaluateConfig):
     machines: Any = plugin("machines")
     algorithms: tuple[str, ...] | None = None
     null_steps: Count = 200_000
-    num_agents: Annotated[int, Field(ge=LEAST, le=LARGEST)] = 20
+    num_agents: Annotated[int, Field(ge=ENOUGH, le=LARGEST)] = 20
     agent_hparams: Literal["default", "as_learned"] = "default"
     real_training: TrainingConfig = dataclasses.replace(REAL_TRAINING, max_steps=20_000)
 

@@ -38,7 +38,7 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 
 # Fields of sejax.run that have an effect here.
-TAKEN = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices",
+USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices",
          "run_dir"}  # fmt: skip
 # The default students and how many steps they train, by kind of actions.
 STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
@@ -103,7 +103,7 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
       ConfigError: for invalid overrides.
     """
     values, texts = compose.partition(overrides, DistillConfig)
-    for name in [name for name in texts if name.partition(".")[0] not in TAKEN]:
+    for name in [name for name in texts if name.partition(".")[0] not in USED]:
         fix = "Set search.generations=N." if name == "generations" else "Leave it out."
         message = f"must be left out, as it has no effect here. {fix}"
         raise ConfigError(f"{shortened(name, 40)} {message}", name)

@@ -119,7 +119,7 @@ class EvaluateConfig(CommandConfig):
         try:
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
-                default, learned = agents.default_for(stored.spec), learned_with(stored.config)
+                default, learned = agents.default_for(stored.spec), agents_in(stored.config)
         except ConfigError:  # loading the proxy raises it later
             if hparams == "as_learned":
                 raise
@@ -137,7 +137,7 @@ class EvaluateConfig(CommandConfig):
         return {"proxy": {"agents": of_names}}
 
 
-def learned_with(config: Mapping[str, Any]) -> Tree:
+def agents_in(config: Mapping[str, Any]) -> Tree:
     """What a stored configuration says of its agents; empty if one of them is not registered."""
     explored = config.get("exploration", {"name": "none"})
     are_known = [header.is_registered("agent", agent) for agent in config["agents"].values()]

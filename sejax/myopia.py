@@ -19,17 +19,17 @@ from scipy.special import stdtrit
 
 MARGIN = 0.1
 LEVEL = 0.95
-LEAST = 5  # independent values that an interval needs
+ENOUGH = 5  # independent values that an interval needs
 NONE = (math.nan, math.nan)  # the interval of fewer values
 
 
 def mean_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float]:
-    """Student's confidence interval of the mean of independent values `[n]`; `NONE` if n < `LEAST`.
+    """Student's interval of the mean of independent values `[n]`; `NONE` if n < `ENOUGH`.
 
     First average values that depend on each other, such as the agents that one proxy trained.
     """
     values = np.asarray(values, float)
-    if values.size < LEAST:
+    if values.size < ENOUGH:
         return NONE
     half = stdtrit(values.size - 1, (1 + level) / 2) * values.std(ddof=1) / values.size**0.5
     return float(values.mean() - half), float(values.mean() + half)
@@ -83,7 +83,7 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     distances = np.abs([lost.mean() - margin, gained.mean() - margin])
     # The width of an interval falls with the square root of the number of agents.
     needed = len(far) * np.max((halves / np.maximum(distances, 1e-9)) ** 2)
-    missing = math.ceil(min(needed, 1e6)) - len(far) if math.isfinite(needed) else LEAST - len(far)
+    missing = math.ceil(min(needed, 1e6)) - len(far) if math.isfinite(needed) else ENOUGH - len(far)
     return Judgement(verdict, float(lost.mean()), low, high, max(1, missing))
 
 

@@ -2,7 +2,7 @@
 
 Intervals of means are Student's, of what was sampled: of the means of SEs or RNs where agents
 belong to them, as agents of one have much in common, else of agents. Percentile bootstraps of 5 to
-10 values cover the truth in 80 to 90% of the cases in place of 95%. Of fewer than `LEAST` values
+10 values cover the truth in 80 to 90% of the cases in place of 95%. Of fewer than `ENOUGH` values
 there is no interval.
 
 Where returns have a ceiling, a mean beside the mean of the worst tenth tells agents apart that an
@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from sejax.myopia import LEAST, LEVEL, NONE
+from sejax.myopia import ENOUGH, LEVEL, NONE
 from sejax.myopia import mean_interval as mean_interval
 
 
 def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[float, float]:
     """Welch's confidence interval of the difference of two means, of independent values `[n], [m]`.
 
-    `NONE` if either has fewer than `LEAST` values.
+    `NONE` if either has fewer than `ENOUGH` values.
     """
     first, second = np.asarray(first, float), np.asarray(second, float)
-    if min(first.size, second.size) < LEAST:
+    if min(first.size, second.size) < ENOUGH:
         return NONE
     errors = np.array([x.var(ddof=1) / x.size for x in (first, second)])
     middle, error = first.mean() - second.mean(), errors.sum()

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.experiment import Settings
-from experiments.common.statistics import LEAST, mean_interval
+from experiments.common.statistics import ENOUGH, mean_interval
 from sejax.ops.files import write_text
 
 
@@ -77,12 +77,12 @@ def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]
 
 def interval_note(of: str) -> str:
     """What a reader must know of means' intervals, and what they take as independent."""
-    return f"In brackets Student's 95% interval over {of}, none for fewer than {LEAST}."
+    return f"In brackets Student's 95% interval over {of}, none for fewer than {ENOUGH}."
 
 
 def drawn_text(number: int, what: str) -> str:
     """What an interval draws, as a cell of a column `interval over`; empty if there is none."""
-    return f"{number} {what}" if number >= LEAST else ""
+    return f"{number} {what}" if number >= ENOUGH else ""
 
 
 def as_texts(

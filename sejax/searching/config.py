@@ -16,7 +16,7 @@ from sejax.searching import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.
-TAKEN = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
+SET_BY_SEARCH = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
 # Names, and fields that may differ between the workers of a study and between its sessions.
 FREE = ("trials", "search_dir", "verify", "fresh_seeds", "study", "space", "devices")
 
@@ -128,7 +128,7 @@ def read(overrides: Sequence[str]) -> StudyPlan:
     for name, text in (ranges | others).items():
         must = f"must be left out, as the search sets it; got {shortened(text)}"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
-        require(name.partition(".")[0] not in TAKEN, name, f"{must}. {fix}")
+        require(name.partition(".")[0] not in SET_BY_SEARCH, name, f"{must}. {fix}")
     space = {name: spaces.parse(name, text) for name, text in ranges.items()}
     fixed = tuple(f"{name}={text}" for name, text in others.items())
     search = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
