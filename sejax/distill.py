@@ -27,7 +27,7 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import ConfigError, Count, Options, field_lines, shortened
+from sejax.options import ConfigError, Count, Options, as_text, field_lines, shortened
 from sejax.options.plain import flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -38,8 +38,7 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 
 # Fields of sejax.run that have an effect here.
-USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices",
-         "run_dir"}  # fmt: skip
+USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices", "run_dir"}
 # The default students and how many steps they train, by kind of actions.
 STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
 STEPS = {"continuous": "10000", "discrete": "2000"}
@@ -108,15 +107,16 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         message = f"must be left out, as it has no effect here. {fix}"
         raise ConfigError(f"{shortened(name, 40)} {message}", name)
     others = {name: f"{name}={text}" for name, text in texts.items()}
-    task = configuration.config([x for name, x in others.items() if name.split(".")[0] == "env"])
-    actions = envs.spec_of(task.env).actions
-    steps = others.get("training.max_steps", STEPS[actions]).rpartition("=")[2]
+    typed = flatten(compose.read([*others.values()], LearnConfig.groups()))  # or in a preset file
+    env = [f"{name}={as_text(x)}" for name, x in typed.items() if name.split(".")[0] == "env"]
+    actions = envs.spec_of(configuration.config(env).env).actions
+    steps = str(typed.get("training.max_steps", STEPS[actions]))
     # An episode of a one-step SE has one step.
     defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
-    if not others.keys() & {"agent", "agents"}:
+    if not any(name.startswith("agents.") for name in typed):
         defaults["agents"] = STUDENTS[actions]
-    words = {name: f"{name}={value}" for name, value in defaults.items()}
-    config = configuration.config([*(words | others).values()])
+    words = [f"{name}={value}" for name, value in defaults.items() if name not in typed]
+    config = configuration.config([*words, *others.values()])
     # The task's reward for being healthy is left out of searches.
     bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
     return from_plain(DistillConfig, merge(bonus, values), ""), config

@@ -202,7 +202,7 @@ def evaluate(config: EvaluateConfig) -> float:
         of_worlds = {world: summary.loc[world].to_json(orient="index") for world in worlds}
         text = json.dumps({world: json.loads(x) for world, x in of_worlds.items()}, indent=2)
     write_text(out_dir / "evaluation.json", text)
-    return float(table[table["world"] == name]["test_return"].mean())
+    return float(summary["test_return_mean"].loc[name].mean())
 
 
 def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:

@@ -5,6 +5,7 @@ import shutil
 import sys
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +13,7 @@ from support import refused
 
 import sejax
 from sejax.distill import folder_of, main, read
-from sejax.distillation import teaching
+from sejax.distillation import policies, teaching
 from sejax.proxies import header, zoo
 
 QUICK = (
@@ -148,6 +149,26 @@ def test_a_model_of_another_algorithm_is_refused(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
+def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
+    """A task's own actions lie in [-1, 1], if the environment's do not lie in some [-x, x]."""
+    space = SimpleNamespace(low=np.zeros(2), high=np.float32([1, 4]))
+    actions = np.tile([0.5, 4.0], (3, 1))
+    model = SimpleNamespace(action_space=space, predict=lambda obs, deterministic: (actions, None))
+    sb3 = SimpleNamespace(SAC=SimpleNamespace(load=lambda path, device: model))
+    monkeypatch.setitem(sys.modules, "stable_baselines3", sb3)
+    task = SimpleNamespace(name="uneven", num_actions=None, action_dim=2, max_action=1.0)
+    act = policies.policy_of("sac:model.zip", task, 1, jax.random.key(0))
+    np.testing.assert_allclose(act(np.zeros((3, 5))), [[0.0, 1.0]] * 3)
+
+
+def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
+    (file := tmp_path / "mine.yaml").write_text(
+        "env: pendulum\nagent: ppo\ntraining.max_steps: 777\n"
+    )
+    config = read([f"preset={file}"])[1]
+    assert (*config.agents, config.training.max_steps) == ("ppo", 777)
+
+
 def test_defaults_are_those_of_the_task():
     own, config = read(["env=hopper"])
     assert own.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
@@ -158,8 +179,7 @@ def test_defaults_are_those_of_the_task():
 
 
 @pytest.mark.parametrize(("words", "name"), [
-    ([], "distill-cartpole-s0"),
-    (["policy=ppo"], "distill-cartpole-ppo-s0"),
+    ([], "distill-cartpole-s0"), (["policy=ppo"], "distill-cartpole-ppo-s0"),
     (["policy=ppo:a/model.zip"], "distill-cartpole-ppo-model-s0"),
     (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
 ])  # fmt: skip

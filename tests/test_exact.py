@@ -94,10 +94,8 @@ def test_a_number_that_never_varies_is_kept():
 
 
 @pytest.mark.parametrize("task, layers, field", [
-    ("cliff_walking", layers_of(48, 4), "env"),
-    ("pendulum", layers_of(4, 1), "policy"),
-    ("pendulum", layers_of(3, 2), "policy"),
-    ("pendulum", [], "policy"),
+    ("cliff_walking", layers_of(48, 4), "env"), ("pendulum", layers_of(4, 1), "policy"),
+    ("pendulum", layers_of(3, 2), "policy"), ("pendulum", [], "policy"),
 ])  # fmt: skip
 def test_what_does_not_fit_is_refused(task, layers, field):
     assert refused(make_exact, sejax.envs.make(task), layers, STATES) == field

@@ -342,8 +342,7 @@ def test_what_is_returned_is_the_callers(num_envs):
 @pytest.mark.parametrize(("task", "num_envs", "good", "bad", "space"), [
     ("cartpole", None, 1, [-1, 2, 0.5, None], r"Discrete\(2\)"),
     ("cartpole", 2, [0, 1], [[0, 2], [0, -1], [0], 0, [0.0, 1.0], [[0, 1]]], "MultiDiscrete"),
-    ("pendulum", None, [7.0], [0.5], "Box"),
-    ("pendulum", 2, [[0.0], [7.0]], [[0.0, 1.0]], "Box"),
+    ("pendulum", None, [7.0], [0.5], "Box"), ("pendulum", 2, [[0.0], [7.0]], [[0.0, 1.0]], "Box"),
 ])  # fmt: skip
 def test_a_step_needs_an_episode_and_an_action_of_the_space(task, num_envs, good, bad, space):
     env = env_of(world_of(task, outputs={"done": 1.0}), num_envs)
@@ -449,8 +448,7 @@ def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
 
 
 @pytest.mark.parametrize(("name", "field", "value"), [
-    ("halfcheetah-rn", "xml_file", "/etc/hostname"),
-    ("cartpole-rn", "render_mode", "human"),
+    ("halfcheetah-rn", "xml_file", "/etc/hostname"), ("cartpole-rn", "render_mode", "human"),
     ("cliff_walking-rn", "goal_reward", "x"),
 ])  # fmt: skip
 def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(
@@ -476,10 +474,8 @@ def test_a_file_that_is_no_single_se_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("field", "options"), [
-    ("num_envs", {"num_envs": 0}),
-    ("num_envs", {"num_envs": 2.5}),
-    ("autoreset_mode", {"autoreset_mode": "samestep"}),
-    ("source", {"source": "carpole"}),
+    ("num_envs", {"num_envs": 0}), ("num_envs", {"num_envs": 2.5}),
+    ("autoreset_mode", {"autoreset_mode": "samestep"}), ("source", {"source": "carpole"}),
 ])  # fmt: skip
 def test_an_option_that_cannot_be_is_one_message(field, options):
     assert refused(make_vec, **{"source": "cartpole"} | options) == field

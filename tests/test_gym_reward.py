@@ -136,11 +136,8 @@ def test_weighted_info_is_a_product(stored_rn, variant):
 
 
 @pytest.mark.parametrize(("kind", "real", "learned", "expected"), [
-    ("additive", np.nan, 1.0, None),
-    ("additive", np.inf, 1.0, None),
-    ("additive", 0.5, 1e9, None),
-    ("additive", -2e7, 1.0, -2e7),
-    ("exclusive", -2e7, 1.0, 1.0),
+    ("additive", np.nan, 1.0, None), ("additive", np.inf, 1.0, None), ("additive", 0.5, 1e9, None),
+    ("additive", -2e7, 1.0, -2e7), ("exclusive", -2e7, 1.0, 1.0),
 ])  # fmt: skip
 def test_an_absurd_reward_is_none_and_terminates(stored_rn, kind, real, learned, expected):
     """A real one of money's size passes, and a learned one does not."""

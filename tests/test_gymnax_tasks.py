@@ -180,10 +180,8 @@ def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
 
 
 @pytest.mark.parametrize(("is_wrapped", "spaces_of_env"), [
-    (False, (spaces.Discrete(2),)),
-    (False, (spaces.Box(-2.0, 2.0, (1,)),)),
-    (True, (spaces.Box(-2.0, 2.0, ()),)),
-    (True, (spaces.Box(-2.0, 1.0, (1,)),)),
+    (False, (spaces.Discrete(2),)), (False, (spaces.Box(-2.0, 2.0, (1,)),)),
+    (True, (spaces.Box(-2.0, 2.0, ()),)), (True, (spaces.Box(-2.0, 1.0, (1,)),)),
     (True, (spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,)),)),
     (True, (spaces.Discrete(2), spaces.Box(0, 1, (2, 2)))),
 ])  # fmt: skip
@@ -195,12 +193,8 @@ DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discr
 
 
 @pytest.mark.parametrize("spaces_of_env", [
-    (DICT,),
-    (TUPLE,),
-    (spaces.Discrete(2), DICT),
-    (spaces.Box(-jnp.inf, 1.0, (1,)),),
-    (spaces.Box(-1.0, jnp.inf, (1,)),),
-    (spaces.Box(1.0, 1.0, (1,)),),
+    (DICT,), (TUPLE,), (spaces.Discrete(2), DICT), (spaces.Box(-jnp.inf, 1.0, (1,)),),
+    (spaces.Box(-1.0, jnp.inf, (1,)),), (spaces.Box(1.0, 1.0, (1,)),),
 ])  # fmt: skip
 def test_spaces_that_no_agent_could_use_are_refused(spaces_of_env):
     assert refused(odd_task, *spaces_of_env) == "env"

@@ -12,7 +12,8 @@ from support import assert_shares, drawing, numpy_forward, raveled, refused, unr
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.ppo import MIN_STD, PPO, ContinuousPPO, PPOConfig, shuffled
+from sejax.agents.ppo import MIN_STD, PPO, ContinuousPPO, PPOConfig, shuffled, std_of
+from sejax.ops.scores import merged_moments
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -112,6 +113,14 @@ def test_learning_phases_equal_torchs(kind):
         state = update_of(ppo(kind))(KEY, state, rollout(kind, number))
         expected = golden[f"{kind}/params/{number}"]
         np.testing.assert_allclose(raveled(state.params), expected, rtol=2e-5, atol=5e-6)
+
+
+def test_the_spread_of_returns_far_from_zero_is_theirs():
+    rows = np.float32(1000 + 0.1 * np.random.default_rng(0).normal(size=(15, 128)))
+    moments = (jnp.zeros(()),) * 3
+    for row in rows:
+        moments = merged_moments(moments, (jnp.float32(128), row.mean(), 128 * row.var()))
+    np.testing.assert_allclose(std_of(moments), rows.astype(float).std(), rtol=1e-3)
 
 
 def test_rewards_that_never_differ_do_not_blow_up_where_they_are_normalized():

@@ -33,6 +33,7 @@ from sejax.ops import cpu
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import clip_by_global_norm, scale_by_adam
+from sejax.ops.scores import Moments, merged_moments
 from sejax.options import (
     LARGEST,
     Activation,
@@ -168,7 +169,7 @@ class PPOState(struct.PyTreeNode):
 
     params: dict[str, PyTree]
     opt_state: optax.OptState
-    return_sums: Float[Array, "3"]  # `power_sums` of all returns; 0 if unused
+    return_moments: Moments  # of all returns, see `merged_moments`; 0 if unused
     hparams: Hparams
 
 
@@ -247,7 +248,7 @@ class PPO(Learner):
         return PPOState(
             params=params,
             opt_state=self.optimizer.init(params),
-            return_sums=jnp.zeros(3),
+            return_moments=(jnp.zeros(()),) * 3,
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
@@ -274,7 +275,7 @@ class PPO(Learner):
         """
         config, hp = self.config, state.hparams
         steps = batch.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
-        rollout, return_sums = self.prepared(state, steps, batch.ended)
+        rollout, return_moments = self.prepared(state, steps, batch.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, rollout.returns.size)
 
         def adam_step(number: Array, carry: Moved) -> Moved:
@@ -291,12 +292,10 @@ class PPO(Learner):
         params, opt_state = jax.lax.fori_loop(
             0, num_updates, adam_step, (state.params, state.opt_state)
         )
-        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
+        return state.replace(params=params, opt_state=opt_state, return_moments=return_moments)
 
-    def prepared(
-        self, state: PPOState, steps: Transition, ended: Steps
-    ) -> tuple[Batch, Float[Array, "3"]]:
-        r"""A rollout, evaluated by the parameters that made it, and sums over all returns so far.
+    def prepared(self, state: PPOState, steps: Transition, ended: Steps) -> tuple[Batch, Moments]:
+        r"""A rollout, evaluated by the parameters that made it, and moments of all returns.
 
         With `advantages="monte_carlo"` returns are normalised. The advantage is the return minus
         the critic's value in each Adam step (`docs/reference.md` 4.5). Nothing is bootstrapped: an
@@ -317,19 +316,21 @@ class PPO(Learner):
 
         Source: Schulman et al. (2016), eq. 11 to 16.
         """
-        hp, params, sums = state.hparams, state.params, state.return_sums
+        hp, params, moments = state.hparams, state.params, state.return_moments
         old_log_prob, _, value = self.evaluate(params, steps.obs, steps.action)
         if self.config.advantages == "monte_carlo":
             decay = jnp.broadcast_to(hp.discount, ended.shape)
             returns = normalized(discounted_sums(steps.reward, decay, ended))
-            return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
+            return Batch(steps.obs, steps.action, old_log_prob, None, returns), moments
         decay, reward = hp.discount * steps.discount, steps.reward
         if self.config.normalize_rewards:
-            sums = sums + power_sums(discounted_sums(reward, decay, ended))
-            reward = reward * (1 / std_of(sums))
+            returns = discounted_sums(reward, decay, ended)
+            squares = jnp.sum((returns - returns.mean()) ** 2)
+            moments = merged_moments(moments, (jnp.float32(returns.size), returns.mean(), squares))
+            reward = reward * (1 / std_of(moments))
         delta = reward + decay * self.value(params, steps.next_obs) - value
         advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
-        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
+        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), moments
 
     def loss(self, params: PyTree, batch: Batch, hp: Hparams) -> Float[Array, ""]:
         r"""What a learning phase minimises.
@@ -417,15 +418,10 @@ def shuffled(
     return order[:, : num_minibatches * size].reshape(-1, size).astype(jnp.int32)
 
 
-def power_sums(x: Steps) -> Float[Array, "3"]:
-    """The count of numbers, their sum, and the sum of their squares."""
-    return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
-
-
-def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
+def std_of(moments: Moments) -> Float[Array, ""]:
     """Standard deviation, at least 1e-4: rewards that are always 0 stay finite when divided."""
-    count, total, squares = power_sums
-    return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
+    count, _, square = moments
+    return jnp.sqrt(jnp.maximum(square / count, 1e-8))
 
 
 def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:

@@ -118,9 +118,10 @@ def _of_sb3(text: str, task: Task) -> Actor:
         message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
         raise ConfigError(message, "policy") from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
-    is_discrete = task.num_actions is not None
-    factor = 1 if is_discrete else task.max_action / np.asarray(model.action_space.high, float)
-    return lambda obs: model.predict(obs, deterministic=True)[0] * factor
+    is_discrete, space = task.num_actions is not None, model.action_space
+    low, high = np.asarray((-1, 1) if is_discrete else (space.low, space.high), float)
+    middle, factor = (low + high) / 2, 2 * task.max_action / (high - low)
+    return lambda obs: (model.predict(obs, deterministic=True)[0] - middle) * factor
 
 
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from sejax.envs.base import Task
 from sejax.evaluation import Steps, Tests, make_fixed, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
-from sejax.ops.scores import or_lowest_finite
+from sejax.ops.scores import merged_moments, or_lowest_finite
 from sejax.options import Count, Finite, NonNegative, Options, Positive, require
 from sejax.proxies.exact import Layer, require_vectors
 from sejax.runs.store import Store
@@ -221,22 +221,12 @@ def step_size(config: SearchConfig, number: Array | int) -> Array:
 
 
 def with_moments(policy: Policy, obs: Float[Array, "step obs_dim"], valid: Array) -> Policy:
-    """The policy with observations added to its moments; its weights stay.
-
-    Source: Chan et al., "Updating formulae and a pairwise algorithm for computing sample variances"
-    (1979).
-    """
+    """The policy with observations added to its moments; its weights stay."""
     count = valid.sum()
     rows = jnp.where(valid[:, None], obs, 0.0)
     mean = rows.sum(0) / jnp.maximum(count, 1)
     square = jnp.where(valid[:, None], (obs - mean) ** 2, 0.0).sum(0)
-    total = policy.num_seen + count
-    apart, share = mean - policy.mean, count / jnp.maximum(total, 1)
-    return policy._replace(
-        num_seen=total,
-        mean=policy.mean + apart * share,
-        square=policy.square + square + apart**2 * policy.num_seen * share,
-    )
+    return Policy(policy.weights, *merged_moments(policy[1:], (count, mean, square)))
 
 
 # --- a whole search, kept on disk ----------------------------------------------------------------

@@ -224,8 +224,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """Episodes of an SE as a Gymnasium vector environment.
 
     Environment i equals `SyntheticGymEnv` after `reset(seed=seed + i)` up to rounding. The others
-    do not affect it: each has its own generator, which draws its starts and ends. Infos and resets
-    are those of `gymnasium.vector.SyncVectorEnv`.
+    do not affect it: each has its own generator, which draws its starts and ends. Infos, and what
+    follows an end, are those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
       world: the SE's world.

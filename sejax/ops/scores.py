@@ -1,7 +1,12 @@
-"""Statistics of scores that may not be finite, or equal but for rounding."""
+"""Statistics of scores that may not be finite, or equal but for rounding; moments of numbers."""
+
+from typing import TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+# Count of numbers, their mean, and the sum of squared differences from it.
+Moments: TypeAlias = tuple[Array, Array, Array]
 
 _TIE = 1e-6  # of the other score, or of 1 if that score is smaller
 
@@ -31,3 +36,16 @@ def or_lowest_finite(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
     finite = jnp.isfinite(scores)
     worst = jnp.min(jnp.where(finite, scores, jnp.inf))
     return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))
+
+
+def merged_moments(moments: Moments, others: Moments) -> Moments:
+    """The moments of two groups of numbers together.
+
+    Source: Chan et al., "Updating formulae and a pairwise algorithm for computing sample variances"
+    (1979).
+    """
+    (count, mean, square), (count_others, mean_others, square_others) = moments, others
+    total = count + count_others
+    apart, share = mean_others - mean, count_others / jnp.maximum(total, 1)
+    square = square + square_others + apart**2 * count * share
+    return total, mean + apart * share, square
