@@ -162,9 +162,7 @@ def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
 
 
 def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
-    (file := tmp_path / "mine.yaml").write_text(
-        "env: pendulum\nagent: ppo\ntraining.max_steps: 777\n"
-    )
+    (file := tmp_path / "x.yaml").write_text("{env: pendulum, agent: ppo, training.max_steps: 777}")
     config = read([f"preset={file}"])[1]
     assert (*config.agents, config.training.max_steps) == ("ppo", 777)
 

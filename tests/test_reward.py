@@ -221,9 +221,8 @@ def test_an_augmented_network_sees_a_discrete_state_and_its_info():
     for action in (0, 1, 1):
         obs, state, reward, *_ = env.step_env(KEY, state, jnp.int32(action), params)
         seen.append(np.append(np.eye(48)[obs], obs % 3))
-        before, after = (
-            numpy_forward(params.weights["potential"], x, "prelu", 1)[0] for x in seen[-2:]
-        )
+        net = params.weights["potential"]
+        before, after = (numpy_forward(net, x, "prelu", 1)[0] for x in seen[-2:])
         np.testing.assert_allclose(reward, GAMMA * after - before, rtol=1e-4, atol=1e-6)
 
 
