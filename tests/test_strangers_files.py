@@ -16,7 +16,7 @@ from support import ended, forge, paper_se, refusal
 
 import sejax
 from experiments import se_histograms
-from sejax import evaluate, run, search
+from sejax import distill, evaluate, run, search
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.runs import commands
@@ -61,9 +61,9 @@ def refused(monkeypatch, capsys):
     return refuse
 
 
-run_command, evaluate_command, search_command = (
+run_command, evaluate_command, search_command, distill_command = (
     functools.partial(commands.start, module.main, module.help_text)
-    for module in (run, evaluate, search)
+    for module in (run, evaluate, search, distill)
 )
 
 
@@ -109,22 +109,20 @@ def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreig
 
 PRESETS = [
     {"env": SHELL["name"], "env.cmd": SHELL["cmd"]},
-    {"env": {"name": IMPORTED}},
-    {"env": IMPORTED},
-    {"agent": IMPORTED},
+    {"env": {"name": IMPORTED}}, {"env": IMPORTED}, {"agent": IMPORTED},
     {"agents": ["ddqn", IMPORTED]},
     {"agents": ["ddqn", "ppo"], "agents.ddqn.name": IMPORTED},
     {"agents": {"ppo": {"name": IMPORTED}}},
     {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
-    {"es.score_transform": IMPORTED},
-    {"tracker": IMPORTED},
-]
+    {"es.score_transform": IMPORTED}, {"tracker": IMPORTED},
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("preset", PRESETS, ids=range(len(PRESETS)))
 def test_a_preset_file_names_no_module(folder, refused, preset):
     (folder / "p.yaml").write_text(yaml.safe_dump(preset))
     refused(run_command, "preset=p.yaml")
+    refused(distill_command, "preset=p.yaml")
     refused(evaluate_command, "preset=p.yaml", "proxy=cartpole")
     refused(search_command, "preset=p.yaml", SPACE)
 

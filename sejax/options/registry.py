@@ -280,10 +280,9 @@ def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
     Raises:
       ConfigError: for anything else.
     """
-    got = (
-        f"got {shortened(repr(part))}. {fix or 'Pass an object; sejax.config([...]) takes names.'}"
-    )
-    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}; {got}")
+    fix = fix or "Pass an object; sejax.config([...]) takes names."
+    message = f"must be a sejax.{cls.__name__}; got {shortened(repr(part))}. {fix}"
+    require(isinstance(part, cls), group, message)
     return cast(T, part)
 
 
