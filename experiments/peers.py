@@ -180,7 +180,7 @@ def stock_students(
     except ImportError as error:
         fix = "Type pip install 'sejax[bench]', or set students=[sejax_default,sejax_varied]"
         raise ConfigError(f"students must be installed; got {error}. {fix}.", "students") from error
-    se_of_rows = {"world": se, "fingerprint": sejax.load_proxy(source).fingerprint}
+    fingerprint = sejax.load_proxy(source).fingerprint
     seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
     for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):
         agent = kind.upper() if sort == "sb3_defaults" else kind
@@ -193,7 +193,7 @@ def stock_students(
 
         shard = f"{task.name}-{se}-{sort}-{kind}-{seed}"
         if settings.is_wanted(shard):
-            depends = training._asdict() | se_of_rows
+            depends = training._asdict() | {"world": se, "fingerprint": fingerprint}
             yield settings.shards.compute(shard, depends, train).assign(kind=kind, seed=seed)
 
 

@@ -22,13 +22,12 @@ from typing import Any
 import jax
 import pandas as pd
 
-from sejax import envs
 from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import ConfigError, Count, Options, field_lines, shortened
-from sejax.options.plain import configure, flatten, from_plain, merge, to_plain
+from sejax.options.plain import flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -108,9 +107,8 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         raise ConfigError(f"{shortened(name, 40)} {message}", name)
     others = {name: f"{name}={text}" for name, text in texts.items()}
     tree = compose.read([*others.values()], LearnConfig.groups())  # also of a preset file
-    typed, env = flatten(tree), tree.get("env", {})
-    env = {"name": compose.choice(env, "env")} | env
-    actions = envs.spec_of(configure("env", env, compose.plugin_paths(overrides))).actions
+    typed, imports = flatten(tree), compose.plugin_paths(overrides)
+    actions = configuration.spec_in(tree.get("env", {}), imports).actions
     steps = str(typed.get("training.max_steps", STEPS[actions]))
     # An episode of a one-step SE has one step.
     defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
