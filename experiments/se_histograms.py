@@ -18,6 +18,7 @@ Of the transitions, which are too many to keep, the rows have how often values w
 bins, and the returns of the tests.
 """
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Mapping
@@ -140,7 +141,8 @@ def make_recorded_run(
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
     capacity = min(max_rows, training.max_steps or max_rows)
-    train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
+    recording = dataclasses.replace(agent, buffer=with_last_steps(agent.buffer, capacity))
+    train = make_tested_trainer(recording, env, task, training, keeps_stored=True)
     test = make_recorder(agent, task, training.test_episodes)
 
     def run(key: Any, env_params: Any, active: Any) -> dict[str, dict[str, Any]]:
@@ -150,7 +152,7 @@ def make_recorded_run(
         predict = jax.vmap(lambda s, a: env.predict(env_params.weights, s, a)[:2])
         next_obs, reward = predict(steps.obs, steps.action)
         episode = jnp.arange(steps.reward.shape[0]) // task.max_steps
-        met, is_made = trained.recorded, jnp.arange(capacity) < trained.train_steps
+        (_, met), is_made = trained.stored, jnp.arange(capacity) < trained.train_steps
         tested = {"next_obs": steps.next_obs, "reward": steps.reward, "episode": episode}
         return {
             "train": {"next_obs": met[:, :-1], "reward": met[:, -1], "valid": is_made},
@@ -161,20 +163,26 @@ def make_recorded_run(
     return run
 
 
-def last_steps(capacity: int) -> BufferMaker:
-    """A recorder of the last `capacity` steps of a training, in no order.
+def with_last_steps(buffer: BufferMaker, capacity: int) -> BufferMaker:
+    """A buffer beside which the last `capacity` steps of a training are kept, in no order.
 
-    Its rows are next state and reward, `[capacity, obs_dim + 1]`.
+    Their rows are next state and reward, `[capacity, obs_dim + 1]`.
     """
 
     def make(example: Any, max_steps: int) -> Buffer:
+        inner = buffer(example, max_steps)
+
         def init() -> Any:
-            return jnp.zeros((capacity, example.next_obs.shape[0] + 1))
+            return inner.init(), jnp.zeros((capacity, example.next_obs.shape[0] + 1))
 
-        def store(rows: Any, step: Any, made: Any, ended: Any, active: Any) -> Any:
-            return write_row(rows, step, jnp.append(made.next_obs, made.reward), active)
+        def store(arrays: Any, step: Any, made: Any, ended: Any, active: Any) -> Any:
+            rows = write_row(arrays[1], step, jnp.append(made.next_obs, made.reward), active)
+            return inner.store(arrays[0], step, made, ended, active), rows
 
-        return Buffer(init=init, store=store, batch=lambda *_: None)
+        def batch(key: Any, arrays: Any, *others: Any) -> Any:
+            return inner.batch(key, arrays[0], *others)
+
+        return dataclasses.replace(inner, init=init, store=store, batch=batch)
 
     return make
 

@@ -14,7 +14,7 @@ into run_dir. The same command resumes where it stopped.
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,14 +33,15 @@ from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
 from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
+from sejax.runs.compose import Tree
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 
 # Fields of sejax.run that have an effect here.
 USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices", "run_dir"}
 # The default students and how many steps they train, by kind of actions.
-STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
-STEPS = {"continuous": "10000", "discrete": "2000"}
+STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
+STEPS = {"continuous": 10_000, "discrete": 2000}
 CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
 CHOOSE, TEST = "choose", "test"  # what students are for
 
@@ -94,6 +95,23 @@ def help_text(overrides: Sequence[str]) -> str:
     return f"{__doc__}\nIts own fields, with their defaults:\n{lines}"
 
 
+class StudentsConfig(LearnConfig):
+    """Task, students and their trainings, with defaults for one-step SEs of a policy."""
+
+    @classmethod
+    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+        """The preset, which is `distilled`, and lengths of trainings and students for the task."""
+        actions = configuration.spec_in(typed.get("env", {}), imports).actions
+        if not compose.names_of(typed["agents"]):
+            students = {name: {"name": name} for name in STUDENTS[actions]}
+            typed = merge(typed, {"agents": students})
+        # An episode of a one-step SE has one step.
+        steps = flatten(typed).get("training.max_steps", STEPS[actions])
+        lengths = {"training": {"max_steps": steps, "max_episodes": steps}}
+        below = super().layers_below({"preset": "distilled"} | typed, imports)
+        return below | {"distill": lengths}
+
+
 def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     """The command's fields, and a configuration of task, students and trainings.
 
@@ -105,17 +123,8 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         fix = "Set search.generations=N." if name == "generations" else "Leave it out."
         message = f"must be left out, as it has no effect here. {fix}"
         raise ConfigError(f"{shortened(name, 40)} {message}", name)
-    others = {name: f"{name}={text}" for name, text in texts.items()}
-    tree = compose.read([*others.values()], LearnConfig.groups())  # also of a preset file
-    typed, imports = flatten(tree), compose.plugin_paths(overrides)
-    actions = configuration.spec_in(tree.get("env", {}), imports).actions
-    steps = str(typed.get("training.max_steps", STEPS[actions]))
-    # An episode of a one-step SE has one step.
-    defaults = {"preset": "distilled", "training.max_steps": steps, "training.max_episodes": steps}
-    if not any(name.startswith("agents.") for name in typed):
-        defaults["agents"] = STUDENTS[actions]
-    words = [f"{name}={value}" for name, value in defaults.items() if name not in typed]
-    config = configuration.config([*words, *others.values()])
+    words = [f"{name}={text}" for name, text in texts.items()]
+    config = configuration.config(words, StudentsConfig)
     # The task's reward for being healthy is left out of searches.
     bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
     return from_plain(DistillConfig, merge(bonus, values), ""), config

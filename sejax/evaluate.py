@@ -170,10 +170,14 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     make = functools.partial(configuration.config, command=EvaluateConfig)
 
-    def folder_of(config: EvaluateConfig, name: str) -> str:
-        return f"runs/evaluate-{as_file_name(config.proxy)}_{name}"
+    def folder_of(config: EvaluateConfig, name: str = "") -> str:
+        parts = as_file_name(config.proxy), name
+        return f"runs/evaluate-{'_'.join(filter(None, parts))}"
 
-    return compose.swept(overrides, make, "out_dir", folder_of, known=("proxy",))
+    configs = compose.swept(overrides, make, "out_dir", folder_of, known=("proxy",))
+    if len(configs) == 1:
+        return configs
+    return [dataclasses.replace(x, out_dir=x.out_dir or folder_of(x)) for x in configs]
 
 
 def evaluate(config: EvaluateConfig) -> float:

@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, Hparams, sizes_of
-from sejax.agents.buffers import Buffer, BufferMaker, Transition
+from sejax.agents.buffers import Buffer, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
@@ -119,7 +119,7 @@ class TrainResult:
         after the last.
       nonfinite: whether a number that is not finite was met: an output of the world or a weight.
       eval_steps: real steps spent on tests between training episodes, `[]` int32.
-      recorded: the steps that the recorder kept, if there was a recorder.
+      stored: arrays of the agent's buffer at the end, if the trainer keeps them; else None.
     """
 
     agent_state: AgentState
@@ -130,7 +130,7 @@ class TrainResult:
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
     eval_steps: Array
-    recorded: PyTree
+    stored: PyTree = None
 
 
 @struct.dataclass
@@ -161,7 +161,7 @@ def make_trainer(
     training: TrainingConfig = TrainingConfig(),
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
-    recorder: BufferMaker | None = None,
+    keeps_stored: bool = False,
     in_batches: bool = True,
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
@@ -183,8 +183,7 @@ def make_trainer(
       solved_reward: for `stop_rule="solved"`.
       test_fn: plays tests on the real task; called after each training episode if
         `training.num_tests_between` is not 0.
-      recorder: keeps steps for the caller, as an agent's `buffer` does for the agent; they are
-        `TrainResult.recorded`.
+      keeps_stored: whether the result has what the agent's buffer holds at the end.
       in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
 
     Raises:
@@ -220,7 +219,7 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    train = _Loop(agent, env, training, solved_reward, test_fn, recorder).train
+    train = _Loop(agent, env, training, solved_reward, test_fn, keeps_stored).train
     if in_batches:
         train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
     return lambda key, env_params, hparams=None, active=True: train(
@@ -244,10 +243,11 @@ class _Loop:
         training: TrainingConfig,
         solved_reward: float,
         test_fn: TestFn | None,
-        recorder: BufferMaker | None,
+        keeps_stored: bool,
     ):
         limit_is_terminal = training.time_limit_is_terminal and is_real(env)
         self.agent, self.training, self.solved_reward = agent, training, solved_reward
+        self.keeps_stored = keeps_stored
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
         self.env = repeat_actions(env, agent.spec.action_repeat)
@@ -259,25 +259,23 @@ class _Loop:
             self.prepare = lambda params, hparams: proxy.prepare(
                 params, agent.discount(hparams), limit_is_terminal
             )
-        self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
 
     def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
         """One training."""
         env_params = self.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = self.begin(key_begin, env_params, hparams, active)
-        stored = tuple(buffer.init() for buffer in self.buffers(state))
+        buffer = self.buffer(state)
         max_episodes = self.training.max_episodes
         no_returns = jnp.full(max_episodes, jnp.nan)
         curve = {"returns": no_returns, "episode_ends": jnp.zeros(max_episodes, jnp.int32)}
         if self.test_fn is not None:
             curve["test_returns"] = no_returns
-        learns_every = self.buffers(state)[0].learns_every
         body, per_check = self.step, STEPS_PER_CHECK
-        if learns_every > 1:
-            body, per_check = partial(self.rollout, learns_every), 1
+        if buffer.learns_every > 1:
+            body, per_check = partial(self.rollout, buffer.learns_every), 1
         (stored, curve), state = while_any_active(
-            body, (stored, curve), state, (key_steps, env_params), per_check
+            body, (buffer.init(), curve), state, (key_steps, env_params), per_check
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -286,7 +284,7 @@ class _Loop:
             **{"test_returns": None} | curve,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             eval_steps=state.eval_steps,
-            recorded=stored[1] if len(stored) > 1 else None,
+            stored=stored if self.keeps_stored else None,
         )
 
     def begin(
@@ -310,16 +308,15 @@ class _Loop:
             tested=jnp.float32(0),
         )
 
-    def buffers(self, state: _LoopState) -> list[Buffer]:
-        """The agent's buffer, and then the recorder's if there is a recorder."""
+    def buffer(self, state: _LoopState) -> Buffer:
+        """The agent's buffer."""
 
         def example() -> Transition:
             act = self.agent.act
             action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
-        shapes = jax.eval_shape(example)
-        return [make(shapes, self.buffer_steps) for make in self.buffer_makers]
+        return self.agent.buffer(jax.eval_shape(example), self.buffer_steps)
 
     def rollout(
         self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
@@ -337,7 +334,7 @@ class _Loop:
         last = dataclasses.replace(state, step=state.step - 1)
         agent_state = jax.lax.cond(
             (state.step == num_steps + length) & (state.episode >= self.agent.spec.learns_from),
-            partial(self.learn, stored[0], None, last, step_keys(key, last.step, 6)),
+            partial(self.learn, stored, None, last, step_keys(key, last.step, 6)),
             lambda agent_state: agent_state,
             state.agent_state,
         )
@@ -354,7 +351,7 @@ class _Loop:
         """One update, after the step that made `transition`."""
         _, _, key_sample, key_update, *_ = keys
         size = self.agent.batch_size(agent_state)
-        buffer, *_ = self.buffers(state)
+        buffer = self.buffer(state)
         batch = buffer.batch(key_sample, arrays, state.step + 1, transition, size)
         return self.agent.update(key_update, agent_state, batch)
 
@@ -363,7 +360,6 @@ class _Loop:
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (stored, curve), (key, env_params) = large, consts
-        buffers = self.buffers(state)
         keys = step_keys(key, state.step, 6)
         key_act, key_env, _, _, *keys_end = keys
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
@@ -379,16 +375,12 @@ class _Loop:
         transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # not in a training that is over
-        stored = tuple(
-            buffer.store(arrays, state.step, transition, ended, active)
-            for buffer, arrays in zip(buffers, stored, strict=True)
-        )
-
+        stored = self.buffer(state).store(stored, state.step, transition, ended, active)
         agent_state = state.agent_state
         if learns:
             agent_state = jax.lax.cond(
                 state.episode >= self.agent.spec.learns_from,
-                partial(self.learn, stored[0], transition, state, keys),
+                partial(self.learn, stored, transition, state, keys),
                 lambda agent_state: agent_state,
                 agent_state,
             )

@@ -165,6 +165,7 @@ def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
     (file := tmp_path / "x.yaml").write_text("{env: pendulum, agent: ppo, training.max_steps: 777}")
     config = read([f"preset={file}"])[1]
     assert (*config.agents, config.training.max_steps) == ("ppo", 777)
+    assert (config.preset, config.agent.rollout_steps) == ("distilled", 256)
 
 
 def test_defaults_are_those_of_the_task():

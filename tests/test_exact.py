@@ -41,8 +41,8 @@ def plain_outputs(layers, obs):
 
 
 def rewards(env, weights, states, actions):
-    each = jax.vmap(jax.vmap(env.bandit_reward, (None, None, 0)), (None, 0, None))
-    return np.asarray(each(weights, states.astype(np.float32), actions))
+    each = jax.vmap(jax.vmap(env.predict, (None, None, 0)), (None, 0, None))
+    return np.asarray(each(weights, states.astype(np.float32), actions)[1])
 
 
 @pytest.mark.parametrize("hidden", [(), (5,), (4, 6)])

@@ -197,7 +197,7 @@ def test_lanes_are_single_environments(name, mode):
         assert_same(got, singles.step(actions))
         num_ended += (got[2] | got[3]).sum()
     assert num_ended > num_envs
-    for seed in (None, 7):
+    for seed in (None, 7, [3, None, 8]):
         assert_same(lanes.reset(seed=seed), singles.reset(seed=seed))
 
 

@@ -9,7 +9,7 @@ from support import forge, numpy_forward, random_like, refused, shapes_of
 
 import sejax
 from sejax import envs
-from sejax.gym import GridWorld, RewardNetwork, make, make_vec, networks
+from sejax.gym import GridWorld, RealTask, RewardNetwork, make, make_vec, networks
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.proxies import header
@@ -239,6 +239,7 @@ def test_what_does_not_fit_is_one_message():
     assert refused(RewardNetwork, gymnasium.make("MountainCar-v0"), "cartpole-rn") == "env"
     # In Gymnasium's cliff walking no fall ends an episode.
     assert refused(RewardNetwork, gymnasium.make("CliffWalking-v1"), "cliff_walking-rn") == "env"
+    assert refused(make, "cartpole-rn", RealTask.of_env(cartpole)) == "task"
     for discount in (float("nan"), 3, "x"):
         assert refused(RewardNetwork, cartpole, "cartpole-rn", discount) == "discount"
     assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500

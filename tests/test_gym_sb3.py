@@ -19,8 +19,9 @@ from sejax.proxies import header
 
 pytest.importorskip("stable_baselines3", reason="needs the extra sb3: make test-examples")
 
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO, TD3
 from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sejax.gym.sb3 import SyntheticVecEnv
@@ -72,6 +73,27 @@ def test_an_agent_of_theirs_trains_there(name):
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
     model.learn(128)
     assert model.num_timesteps == 128 and len(model.ep_info_buffer) > 0
+
+
+ONE_STEP = ["acrobot", "cartpole_v1", "mountain_car", "mountain_car_continuous", "pendulum"]
+
+
+@pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")
+@pytest.mark.parametrize(
+    "name", ["cartpole", *(pytest.param(x, marks=pytest.mark.slow) for x in ONE_STEP)]
+)
+def test_an_agent_of_theirs_solves_a_task_of_which_it_has_never_seen_a_step(name):
+    task = sejax.envs.make(name)
+    real = gymnasium.make(sejax.gym.GYMNASIUM_IDS[name], max_episode_steps=task.max_steps)
+    options = {"learning_rate": 1e-3, "learning_starts": 200, "train_freq": 1, "device": "cpu"}
+    if task.num_actions is not None:
+        options |= {"target_update_interval": 100, "exploration_final_eps": 0.05}
+    cls, network = TD3 if task.num_actions is None else DQN, {"net_arch": [64, 64]}
+    agents = (
+        cls("MlpPolicy", sejax.gym.make(name), policy_kwargs=network, seed=seed, **options)
+        for seed in range(2)
+    )
+    assert any(evaluate_policy(x.learn(4000), real)[0] >= task.solved_reward for x in agents)
 
 
 @pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")

@@ -1,5 +1,6 @@
 """Any environment of gymnax as a task: vectors in, vectors out, limits kept, faults told."""
 
+import copy
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ import sejax
 from sejax import envs
 from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
+from sejax.envs.spec import Box
 from sejax.envs.wrappers import AsVectors
 from sejax.options import registry
 
@@ -187,6 +189,13 @@ def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
 ])  # fmt: skip
 def test_environments_that_agents_can_take_as_they_are_are_left_alone(is_wrapped, spaces_of_env):
     assert isinstance(odd_task(*spaces_of_env).env, AsVectors) == is_wrapped
+
+
+def test_uneven_actions_of_an_environment_of_sejax_are_scaled_too():
+    env = copy.copy(envs.make("pendulum").env)
+    env.spaces = env.spaces[0], Box((0.0,), (10.0,))
+    task = Task(name="uneven", env=env)
+    assert isinstance(task.env, AsVectors) and task.action == Box((-1.0,), (1.0,))
 
 
 DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])

@@ -1,4 +1,4 @@
-"""The proxies that ship: what is said of them, and that anybody's agents learn on them."""
+"""The proxies that ship: what is said of them."""
 
 import dataclasses
 import math
@@ -7,24 +7,17 @@ import shlex
 import sys
 from pathlib import Path
 
-import gymnasium
-import numpy as np
 import pytest
-from plain_agents import agent_for, learn, mean_return
 from support import evaluation, refused
 
 import sejax
-from sejax import envs
 from sejax.distill import read
 from sejax.evaluate import setup_of
-from sejax.gym import GYMNASIUM_IDS, make
 from sejax.options.plain import configure
 from sejax.proxies import header, zoo
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
-# Those that agents learned. Students of a distilled SE are other agents than a plain one.
-SES = [name for name, x in PROXIES.items() if x.kind == "se" and "distilled" not in name]
 ROOT = Path(__file__).parents[1]
 
 
@@ -112,25 +105,3 @@ def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
     evaluations = [evaluation | {name: value}]
     sejax.save(path, proxy.env, proxy.params.weights, evaluations=evaluations)
     assert refused(zoo.describe, header.read(path)) == "record.evaluations"
-
-
-# --- what they teach -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name", [name if name == "cartpole" else pytest.param(name, marks=pytest.mark.slow)
-             for name in SES]
-)  # fmt: skip
-def test_an_agent_that_sees_gymnasiums_five_values_alone_learns_the_task(name):
-    """Two of three solve a task of which they have never seen a step; the cheetah runs."""
-    task = envs.make(PROXIES[name].task)
-    real = gymnasium.make(GYMNASIUM_IDS[task.name], max_episode_steps=task.max_steps)
-    env = make(name)
-    expected = {"halfcheetah": 1500.0}.get(name, task.solved_reward)
-    returns = []
-    for seed in range(3):
-        agent = learn(agent_for(env, seed), env, num_steps=4000, seed=seed)
-        returns.append(mean_return(agent, real, num_episodes=10, seed=100))
-        if sum(np.array(returns) >= expected) == 2:
-            return  # whatever the third would do
-    pytest.fail(f"returns of the agents: {returns}")

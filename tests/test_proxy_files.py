@@ -67,6 +67,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     assert proxy.config == known | {"run_dir": None}  # no path of a machine
     assert header.read(path).header.config == proxy.config
     assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
+    assert refused(proxy.learned_with, "training") == "group"
     own = {"agents": {"mine": {"name": "my:Agent", "weight": 3}}}  # an own agent's own field
     assert header.upgraded(own) == own
 
@@ -318,10 +319,13 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
 # --- names ---------------------------------------------------------------------------------------
 
 
-def test_an_unknown_name_lists_the_shipped_ones():
+def test_an_unknown_name_lists_the_shipped_ones(tmp_path, monkeypatch):
     error = refusal(sejax.load, "carpole")
     assert error.field == "source" and "Did you mean source=cartpole?" in str(error)
     assert "=real?" not in str(refusal(sejax.load, "real"))  # a word of a command's
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cartpole").mkdir()  # a folder without a proxy
+    assert sejax.load("cartpole")
 
 
 @pytest.mark.parametrize("name, given", [

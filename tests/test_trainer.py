@@ -356,25 +356,27 @@ def test_the_tester_equals_greedy_episodes_in_gymnasium():
     assert len(set(np.asarray(steps).tolist())) > 1  # different initial states
 
 
-# --- steps that are kept for whoever looks -------------------------------------------------------
+# --- steps that a buffer keeps --------------------------------------------------------------------
 
 LENGTHS = [2, 3, 6, 1] * 3
 
 
-def row_recorder(example, max_steps):
-    """Keeps episode, time and whether it ended of each step, by the memories' contract."""
+def row_buffer(example, max_steps):
+    """Keeps episode, time and whether it ended of each step, by the buffers' contract."""
     assert example.obs.shape == (2,) and max_steps == 100
 
     def store(rows, step, transition, ended, active):
         row = jnp.stack([transition.action // WHO, transition.obs[0].astype(int), ended])
         return rows.at[step].set(jnp.where(active, row, rows[step]))
 
-    return Buffer(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
+    batch = scripted_agent().init(KEY, 0.0).batch
+    return Buffer(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=lambda *_: batch)
 
 
-def test_a_recorder_is_handed_every_step_and_none_after_the_last():
+def test_a_buffer_is_handed_every_step_and_none_after_the_last():
     config = training(stop_rule="plateau", max_steps=100)
-    train = make_trainer(scripted_agent(INIT_EPISODES), ENV, config, recorder=row_recorder)
+    agent = dataclasses.replace(scripted_agent(INIT_EPISODES), buffer=row_buffer)
+    train = make_trainer(agent, ENV, config, keeps_stored=True)
     params = stacked([script(returns, LENGTHS) for returns in (range(12), [3] * 12)])
     result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params, jnp.zeros(2))
     for lane, num_episodes in ((0, 12), (1, 5)):
@@ -385,8 +387,8 @@ def test_a_recorder_is_handed_every_step_and_none_after_the_last():
         ]
         assert result.episodes[lane] == num_episodes
         assert result.train_steps[lane] == len(expected)
-        np.testing.assert_array_equal(result.recorded[lane, : len(expected)], expected)
-        np.testing.assert_array_equal(result.recorded[lane, len(expected) :], -1)
+        np.testing.assert_array_equal(result.stored[lane, : len(expected)], expected)
+        np.testing.assert_array_equal(result.stored[lane, len(expected) :], -1)
 
 
 def scripted_task(length):

@@ -12,7 +12,7 @@ import sejax
 from sejax import envs
 from sejax.agents import AgentOptions, make_agent
 from sejax.agents.base import drawing_key
-from sejax.agents.buffers import Transition, block_size, sum_over_batch
+from sejax.agents.buffers import Transition, block_size, num_columns, sum_over_batch
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
@@ -194,6 +194,19 @@ def test_every_drawn_agent_finds_the_smallest_network_with_room():
         inner = (int(depth) - 1) * size * (size + 1)
         assert lengths[variant] == size * 5 + inner + 2 * (size + 1)
     assert len(set(variants.tolist())) == len(varied.agents) == sum(map(len, sizes.values()))
+
+
+def test_a_network_that_is_not_varied_leaves_room_for_a_batch_that_is():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class FixedNetwork(DDQNConfig):
+        hidden_size: int = option(8)
+        num_layers: int = option(1)
+
+    (agent,) = make_agent(FixedNetwork(), envs.make("cartpole"), varied=True).varied.agents
+    obs, zero = jnp.zeros(4), jnp.float32(0)
+    buffer = agent.buffer(Transition(obs, jnp.int32(0), zero, zero, obs), 100)
+    largest = 3 * FixedNetwork().batch_size
+    assert num_columns(buffer.batch(KEY, buffer.init(), 1, None, largest)) == largest
 
 
 def test_the_agent_inside_an_exploring_one_is_varied():

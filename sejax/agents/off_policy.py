@@ -50,9 +50,9 @@ class OffPolicyOptions(AgentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        field, most = "agent.batch_size", self.buffer_size
-        got = f"got {self.batch_size}. Set {field}={most}."
-        require(self.batch_size <= most, field, f"must be at most agent.buffer_size={most}; {got}")
+        most, got = self.buffer_size, self.batch_size
+        must = f"must be at most agent.buffer_size={most}; got {got}. Set agent.buffer_size={got}."
+        require(got <= most, "agent.batch_size", must)
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""

@@ -105,14 +105,12 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     ranges = ranges_of(config)
     shapes: list[tuple[int, int]] = []  # (depth, room for hidden units) of each variant, ascending
     agent = make(config)
-    variants = [agent]
     if "hidden_size" in ranges:
         depths = range(int(ranges["num_layers"].low), int(ranges["num_layers"].high) + 1)
-        sizes = {depth: hidden_sizes(ranges["hidden_size"], depth) for depth in depths}
-        shapes = [(depth, size) for depth in depths for size in sizes[depth]]
-        room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
-        changes = [room | {"num_layers": depth, "hidden_size": size} for depth, size in shapes]
-        variants = [make(dataclasses.replace(config, **change)) for change in changes]
+        shapes = [(x, size) for x in depths for size in hidden_sizes(ranges["hidden_size"], x)]
+    room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
+    sizes = [{"num_layers": depth, "hidden_size": size} for depth, size in shapes] or [{}]
+    variants = [make(dataclasses.replace(config, **room, **change)) for change in sizes]
 
     def draw(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
         drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())

@@ -193,10 +193,9 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
       ConfigError: for a space that is no box and not discrete, or actions without bounds.
     """
     observation, action = spaces_of(env, params)
-    if isinstance(env, Environment) and env.spaces is not None:
-        return env
     shape = env.action_space(params).shape
-    has_plain_obs = isinstance(observation, Discrete)
+    is_own = isinstance(env, Environment) and env.spaces is not None
+    has_plain_obs = is_own or isinstance(observation, Discrete)
     if not has_plain_obs:  # a real observation tells; a space may be wrong (gymnax's FourRooms)
         came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
         has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32

@@ -11,14 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import (
-    Evaluations,
-    NumMembers,
-    Scale,
-    Strategy,
-    StrategyOptions,
-    StrategyState,
-)
+from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
 from sejax.options import Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
-from sejax.options import ConfigError, Count, checked
+from sejax.options import ConfigError, Count, checked, require
 from sejax.options.plain import configure
 from sejax.proxies.header import Header, pretrained_names, read
 
@@ -146,6 +146,8 @@ def _read(
     checked([num_envs], Count, "num_envs", 8)
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
+        message = "must be an id of Gymnasium for an RN; got a RealTask. Set task=ID."
+        require(not isinstance(task, RealTask), "task", message)
         return header, None
     config = configure("proxy", header.config["proxy"])
     return header, SyntheticWorld(weights, config, se_task(header, config, task))

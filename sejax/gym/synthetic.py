@@ -1,7 +1,7 @@
 """Synthetic environments (SEs) in NumPy: the networks, and one episode or many side by side."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -257,18 +257,27 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._num_used = np.full(num_envs, num_drawn)  # of the drawn starts
 
     def reset(
-        self, *, seed: int | None = None, options: Info | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
     ) -> tuple[np.ndarray, Info]:
         """Begins an episode in each environment.
 
         Args:
-          seed: of the first environment; the others have seed + 1, seed + 2, ...
+          seed: of the first environment, the others have seed + 1, seed + 2, ...; or of each one.
+            An environment without a seed keeps its generator.
           options: have no effect.
+
+        Raises:
+          ConfigError: for another number of seeds.
         """
-        if seed is not None or not self._generators:
-            seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
-            self._generators = [seeding.np_random(number)[0] for number in seeds]
-            self._num_used[:] = self._drawn.shape[1]  # starts drawn before are void
+        if not isinstance(seed, Sequence):
+            seed = [None if seed is None else seed + i for i in range(self.num_envs)]
+        require(len(seed) == self.num_envs, "seed", f"must be one, or {self.num_envs} of them.")
+        known = self._generators
+        is_new = np.array([number is not None or not known for number in seed])
+        self._num_used[is_new] = self._drawn.shape[1]  # starts drawn before are void
+        self._generators = [
+            seeding.np_random(seed[i])[0] if new else known[i] for i, new in enumerate(is_new)
+        ]
         self._ended = np.zeros(self.num_envs, np.bool_)
         self.begin(~self._ended)
         return self.observe(), {}

@@ -58,7 +58,7 @@ def make_exact(
       >>> task = sejax.envs.make("pendulum")
       >>> layers = [(np.array([[0.0, -8.0, -2.0]]), np.zeros(1))]
       >>> env, weights = make_exact(task, layers, np.random.default_rng(0).normal(size=(99, 3)))
-      >>> reward = env.bandit_reward(weights, np.array([1.0, 0.1, 0.0]), np.array([-0.8]))
+      >>> _, reward, _ = env.predict(weights, np.array([1.0, 0.1, 0.0]), np.array([-0.8]))
       >>> abs(float(reward)) < 1e-6
       True
     """

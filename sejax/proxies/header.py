@@ -16,7 +16,7 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import LARGEST, ConfigError, registry, require, require_known, shortened
+from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
 from sejax.options.plain import configure, expanded, from_plain
 from sejax.proxies import hub
 
@@ -186,12 +186,12 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path
     if os.path.isfile(file):
         return Path(file)
+    if name in pretrained_names():
+        return PRETRAINED_DIR / f"{name}.safetensors"
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
         there = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError(f"{option} {there}; got {shortened(name)}, where there is none.", option)
-    if name not in pretrained_names():
-        require_known(option, shortened(name), [*pretrained_names(), *also])
-    return PRETRAINED_DIR / f"{name}.safetensors"
+    raise unknown_name(option, name, [*pretrained_names(), *also])
 
 
 # --- reading and writing --------------------------------------------------------------------------

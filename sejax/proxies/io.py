@@ -57,13 +57,14 @@ class _Loaded:
         For its training see `sejax.training_of`.
 
         Raises:
-          ConfigError: if the file lacks the part, or names one that is not registered, because a
-            file's names are never imported.
+          ConfigError: for an unknown part, and if the file lacks the part, or names one that is not
+            registered, because a file's names are never imported.
 
         Example:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
+        require_known("group", group, registry.GROUPS)
         if group != "agent":
             return header.configured(group, self.config.get(group), self.path.name)
         agents = self.learned_agents()

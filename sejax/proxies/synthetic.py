@@ -149,7 +149,7 @@ class SyntheticConfig(ProxyConfig):
         low, high = (np.asarray(x, np.float32) for x in (space.low, space.high))
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
-        middle, one = (low + high) / 2, (high - low) / 4
+        middle, one = (low + high) / 2, np.where(low < high, high - low, 4) / 4
         return Units(middle.astype(np.float32), one.astype(np.float32))
 
     def make(self, task: Task) -> "SyntheticEnv":
@@ -320,9 +320,3 @@ class BanditEnv(SyntheticEnv):
         best = self._apply(weights, "reward", self._seen(vector))
         apart = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
         return vector, -jnp.abs(apart).sum(), jnp.float32(1)
-
-    def bandit_reward(
-        self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array
-    ) -> Float[Array, ""]:
-        """The reward of an action in a state that agents observe as it is."""
-        return self.predict(weights, obs, action)[1]

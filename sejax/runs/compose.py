@@ -193,12 +193,12 @@ def swept(
     for of_run in expand(overrides):
         config = make(of_run)
         folder = getattr(config, field)
-        named_by = known if folder is None else (field,)
+        named_by = (field,) if folder else known
         words = [word for word, values in zip(of_run, overrides, strict=True) if word != values]
         name = as_file_name(",".join(x for x in words if x.partition("=")[0] not in named_by))
         name = name if len(name) <= 120 else hashlib.sha256(name.encode()).hexdigest()[:16]
         if name:
-            folder = folder_of(config, name) if folder is None else f"{folder}/{name}"
+            folder = f"{folder}/{name}" if folder else folder_of(config, name)
         configs.append(dataclasses.replace(config, **{field: folder}))
     return configs
 
