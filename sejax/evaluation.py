@@ -20,7 +20,6 @@ from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.wrappers import repeat_actions
 from sejax.objectives import Outcome
-from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, in_batches_on_cpu, spread_over_devices
@@ -374,9 +373,7 @@ def _evaluation_program(
     evaluate = make_evaluator(agent, env, task, training, in_batches=False)
 
     def program(keys: Array, env_params: PyTree) -> Outcome:
-        width = num_parallel_on_cpu(agent, training)
-        if width is not None:
-            width = min(width, cpu.width_of(keys.shape[0]))
+        width = num_parallel_on_cpu(agent, training, keys.shape[0])
         train = functools.partial(evaluate, env_params=env_params)
         spread: Outcome = spread_over_devices(train, devices, num_parallel, width)(keys)
         return spread

@@ -1,7 +1,8 @@
 """From the outcomes of a generation to the scores of its candidates.
 
 `Scoring` applies an objective to both groups of a generation, the population and the incumbent. It
-gives the scores that the strategy compares and the scores that people see.
+gives the scores that the strategy compares and the scores that people see. These differ only with a
+mixture of agents, or if a curriculum (`MaxReward.first_eval_steps`) shortens the scored episodes.
 """
 
 import dataclasses
@@ -74,6 +75,16 @@ class GenerationInfo:
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
     """How outcomes become scores, with one agent or a mixture.
+
+    Trainings are numbered candidate by candidate, and then come those on the incumbent. So two
+    agents, two mirrored pairs of candidates (0 and 2, 1 and 3), two evaluations of each candidate
+    and two of the incumbent give:
+
+    ========= ===== ===== ===== ===== =========
+    candidate 0     1     2     3     incumbent
+    trainings 0, 1  2, 3  4, 5  6, 7  8, 9
+    agent     0     1     0     1     0, 1
+    ========= ===== ===== ===== ===== =========
 
     Attributes:
       objective: the score of one outcome.

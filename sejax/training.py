@@ -20,6 +20,7 @@ from sejax.agents.buffers import Buffer, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.wrappers import repeat_actions
+from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
 from sejax.ops.modes import require_modes
@@ -227,10 +228,14 @@ def make_trainer(
     )
 
 
-def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+def num_parallel_on_cpu(
+    agent: Agent, training: TrainingConfig, num_agents: int = LARGEST
+) -> int | None:
     """Agents in a vmapped batch of a CPU core; None for all; 1 if each may stop at its own time."""
-    num_parallel = agent.spec.cpu_num_parallel
-    return num_parallel if num_parallel is None or training.is_fixed_length else 1
+    width = agent.spec.cpu_num_parallel
+    if width is None or not training.is_fixed_length:
+        return width and 1
+    return min(width, cpu.width_of(num_agents))
 
 
 class _Loop:
