@@ -48,8 +48,9 @@ def main() -> None:
     if not args.path.exists():
         learn_a_set(args.path, args.size, args.generations)
     proxies = sejax.load_set(args.path)
-    agent = sejax.make_agent(AGENT, proxies.task)
-    training = sejax.TrainingConfig(max_steps=1000, stop_rule="never")
+    is_told = "training" in proxies.config  # as in those of results/
+    agent = sejax.agent_of(proxies) if is_told else sejax.make_agent(AGENT, proxies.task)
+    training = sejax.training_of(proxies) if is_told else sejax.TrainingConfig(max_steps=1000)
     evaluate = sejax.make_evaluator(agent, proxies.env, proxies.task, training)
 
     def train_and_test(key: jax.Array, weights: object) -> sejax.Outcome:

@@ -21,8 +21,6 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
 from sejax import agents, envs
 from sejax.agents import AgentConfig
@@ -328,19 +326,15 @@ def print_table(
     summary: pd.DataFrame, title: str, last: str, shown: Mapping[str, tuple[str, int]] = SHOWN
 ) -> None:
     """Prints what `summarise` returns, a row for each group, and a last line below."""
-    labels = ["trained on", "agent"][: summary.index.nlevels]
-    table = Table(title=title)
-    for column in (*labels, *shown):
-        table.add_column(column, justify="left" if column in labels else "right")
-    for index, row in summary.iterrows():
-        numbers = (spread(row[f"{x}_mean"], row[f"{x}_std"], n) for x, n in shown.values())
-        table.add_row(*([index] if len(labels) == 1 else index), *numbers)
-    console = Console(highlight=False)
-    console.print(table)
-    diverged = int(summary["num_nonfinite"].sum())
-    if diverged:
-        console.print(f"{diverged} agents met a number that is not finite.")
-    console.print(last, soft_wrap=True)
+    columns = {}
+    for label, (name, digits) in shown.items():
+        pairs = zip(summary[f"{name}_mean"], summary[f"{name}_std"], strict=True)
+        columns[label] = [spread(mean, std, digits) for mean, std in pairs]
+    table = pd.DataFrame(columns, summary.index).rename_axis([None] * summary.index.nlevels)
+    print(f"{title}\n\n{table.rename_axis(columns='trained on').to_string(sparsify=False)}\n")
+    if diverged := int(summary["num_nonfinite"].sum()):
+        print(f"{diverged} agents met a number that is not finite.")
+    print(last)
 
 
 if __name__ == "__main__":

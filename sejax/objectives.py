@@ -77,13 +77,22 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """Scores; nan for trainings that diverged."""
-        return jnp.where(outcome.nonfinite, jnp.nan, self.score(outcome))
+    def __call__(
+        self, outcome: Outcome, score: Callable[[Outcome], Array] | None = None
+    ) -> Float[Array, "*agent"]:
+        """Scores, of `score` unless another function is given; nan for trainings that diverged.
+
+        Raises:
+          ConfigError: unless there is a score for each agent.
+        """
+        scores, shape = jnp.asarray((score or self.score)(outcome)), outcome.nonfinite.shape
+        must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
+        require(scores.shape == shape, "objective", must)
+        return jnp.where(outcome.nonfinite, jnp.nan, scores)
 
     def shown_score(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
-        return jnp.where(outcome.nonfinite, jnp.nan, (self.shown or self.score)(outcome))
+        return self(outcome, self.shown)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,7 @@ from sejax.agents.ppo import PPOConfig
 from sejax.evaluate import evaluate, setup_of, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
-from sejax.options.plain import configure
-from sejax.proxies.io import budget_for
+from sejax.options.plain import configure, to_plain
 from sejax.runs import plots
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
@@ -94,6 +93,15 @@ def test_one_agent_has_no_deviation_and_a_live_line_changes_no_number(
     assert set(pd.read_csv(live).world) == {"the real task"}  # which alone can be evaluated
 
 
+def budget_for(training, agent, learned_with, length):
+    """The training on an SE of cartpole of this length, 1 or 200, that others were learned with."""
+    config = sejax.SyntheticConfig(hidden_size=2, horizon=1 if length == 1 else None)
+    agents = {str(i): to_plain(x, "agent") for i, x in enumerate(learned_with)}
+    learned = {"training": to_plain(training), "agents": agents}
+    env = config.make(envs.make("cartpole")).with_default_params(None, learned)
+    return sejax.training_of(env, agent)
+
+
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
     then, training = proxy.learned_with("agent"), sejax.training_of(proxy)
@@ -106,11 +114,11 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
         # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
         (long, [then], 1, 50 + 401), (waits, [then], 1, 50 + 3),
     ):  # fmt: skip
-        assert budget_for(training, agent, learned_with, length, 200).max_steps == budget
+        assert budget_for(training, agent, learned_with, length).max_steps == budget
     # Of one step each: as many episodes more.
-    assert budget_for(training, long, [then], 1, 200).max_episodes == training.max_episodes + 401
+    assert budget_for(training, long, [then], 1).max_episodes == training.max_episodes + 401
     unlimited = paper_training()
-    assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
+    assert budget_for(unlimited, PPOConfig(), [then], 200) == unlimited
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
@@ -199,7 +207,8 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
 def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     """Also for a stranger's task, which is not imported: what agents see is in the file."""
     theirs = tmp_path / "theirs.safetensors"
-    task = dataclasses.replace(envs.make("pendulum"), name="theirs", origin={"name": "their:Task"})
+    task = dataclasses.replace(envs.make("pendulum"), name="theirs")
+    vars(task)["origin"] = {"name": "their:Task"}
     env = paper_se(hidden_size=4, initial_state="learned", horizon=1).make(task)
     sejax.save(theirs, env, env.init_weights(jax.random.key(0)))
     for proxy, agent in ((room, "q_learning"), ("pendulum agent_hparams=default", "td3"),

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import sys
+from pathlib import Path
 
 import gymnasium
 import jax
@@ -206,6 +207,7 @@ def test_gymnasium_makes_the_shipped_ones_by_their_names():
     assert sejax.gym.register() == sejax.gym.register() == ids
     env = gymnasium.make("sejax/cartpole")
     assert env.spec.id == "sejax/cartpole" and "TimeLimit" not in str(env)
+    assert Path(env.spec.kwargs["source"]).is_absolute()  # whatever is in the current folder
     assert gymnasium.make("sejax/cartpole", render_mode="rgb_array")  # as make_vec_env of SB3 asks
     own = {"vectorization_mode": "vector_entry_point", "autoreset_mode": AutoresetMode.SAME_STEP}
     for name, options in (("sejax/cartpole", {}), ("sejax.gym:sejax/cartpole", own)):
@@ -368,6 +370,7 @@ def test_continuous_actions_are_clipped_to_the_bounds(num_envs):
 
 PROGRAM = """
 import sys
+from pathlib import Path
 import sejax
 sejax.pretrained()
 assert "gymnasium" not in sys.modules
@@ -420,11 +423,11 @@ def test_an_unknown_task_must_be_given(stored):
     for given in ("CartPole-v1", other):
         assert refused(make, path, given) == "task"
     images = dataclasses.replace(mine, observation_space=spaces.Box(0, 1, (2, 2)))
-    assert refused(make, path, images) == "weights"
+    assert refused(make, path, images) == "task"
 
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
-    task = dataclasses.replace(envs.make("pendulum"), name="mine", origin=None)
+    task = dataclasses.replace(envs.make("pendulum"), name="mine")
     path = stored(jax_se(task, initial_state="learned", state_units="bounds"))
     env, given = make(path), make(path, "Pendulum-v1")
     assert env.action_space == given.action_space

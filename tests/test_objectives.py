@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import refused
 
 from sejax import envs
 from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
@@ -69,3 +70,8 @@ CONFIGS = [configure("objective", {"name": name}) for name in NAMES]
 def test_a_training_that_diverged_has_no_score(objective):
     scores = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
     assert np.isnan(scores[0]) and np.isfinite(scores[1])
+
+
+def test_an_objective_must_score_each_agent():
+    mean_of_all = Objective(score=lambda outcome: outcome.test_returns.mean())
+    assert refused(mean_of_all, outcome([1.0, 2.0], [10, 10], [False, False])) == "objective"

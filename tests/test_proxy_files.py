@@ -108,6 +108,13 @@ def test_a_set_comes_back_and_parts_of_it_are_chosen_by_score_and_place(tmp_path
     assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
 
 
+def test_a_set_of_one_plays_in_numpy_too(tmp_path):
+    env, params = sejax.load("cartpole")
+    sejax.save_set(tmp_path / "set.safetensors", env, [params.weights], [{}])
+    assert sejax.gym.make(str(tmp_path / "set.safetensors")).reset(seed=0)
+    assert refused(sejax.save, tmp_path / "p.safetensors", env, params) == "weights"
+
+
 def test_registering_with_gymnax_is_idempotent():
     gymnax = pytest.importorskip("gymnax")
     ids = sejax.register_gymnax()
@@ -249,11 +256,19 @@ def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
     longer = dataclasses.replace(task, max_steps=task.max_steps + 1)
     assert sejax.load(path, task=longer)[0].task is longer  # an RN: the same dynamics
     se = tmp_path / "se.safetensors"
-    env, weights = an_se_of(dataclasses.replace(envs.make("pendulum"), name="theirs", origin=None))
+    env, weights = an_se_of(dataclasses.replace(envs.make("pendulum"), name="theirs"))
     sejax.save(se, env, weights)
     for change in ({"max_steps": 7}, {"env": envs.make("acrobot").env}):
         other = dataclasses.replace(env.task, **{"params": None, "max_steps": 200} | change)
         assert refused(sejax.load, se, task=other) == "task"
+
+
+def test_a_task_that_was_changed_by_hand_must_be_given(tmp_path):
+    task = dataclasses.replace(envs.make("cartpole"), max_steps=50)
+    env, path = RewardConfig(hidden_size=3).make(task), tmp_path / "rn.safetensors"
+    sejax.save(path, env, env.init_weights(jax.random.key(0)), discount=0.9)
+    assert refused(sejax.load, path) == "task"
+    assert sejax.load(path, task=task)[0].task is task
 
 
 # --- without the task ----------------------------------------------------------------------------
@@ -265,7 +280,7 @@ def an_se_of(task, **config):
 
 
 def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
-    task = dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None)
+    task = dataclasses.replace(envs.make("pendulum"), name="by hand")
     env, weights = an_se_of(task, state_units="bounds")
     path = tmp_path / "se.safetensors"
     sejax.save(path, env, weights)
@@ -299,7 +314,7 @@ def rollout(env, params, key, num_steps=4):
 @pytest.mark.parametrize("config", [RewardConfig(hidden_size=3), paper_se(hidden_size=3)],
                          ids=["an RN", "an SE that begins there"])  # fmt: skip
 def test_what_runs_its_task_needs_it(tmp_path, config):
-    env = config.make(dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None))
+    env = config.make(dataclasses.replace(envs.make("pendulum"), name="by hand"))
     weights = env.init_weights(jax.random.key(0))
     sejax.save(tmp_path / "p.safetensors", env, weights, discount=0.7)
     assert refused(sejax.load, tmp_path / "p.safetensors") == "task"

@@ -212,7 +212,7 @@ def test_an_augmented_network_sees_a_discrete_state_and_its_info():
             return *stepped, info | {"light": jnp.float32(stepped[0] % 3)}
 
     keys, walk = ("light",), envs.make("cliff_walking")
-    lit = {"env": Lit(walk.env), "info_keys": keys, "augmented_keys": keys, "origin": None}
+    lit = {"env": Lit(walk.env), "info_keys": keys, "augmented_keys": keys}
     task = dataclasses.replace(walk, **lit)
     env = RewardConfig(variant="exclusive_potential", augmented=True, hidden_size=5).make(task)
     params = env.prepare(env.params(env.init_weights(KEY)), GAMMA)

@@ -74,7 +74,7 @@ class Condition:
     def plain(self) -> dict[str, Any]:
         """What the results of all groups depend on, beside seeds and weights."""
         return {
-            "task": self.task.origin,
+            "task": self.task.origin or self.task.name,
             "agent": to_plain(self.agent, "agent"),
             "exploration": to_plain(self.exploration, "exploration"),
             "training": to_plain(self.training),

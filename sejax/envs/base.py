@@ -42,6 +42,8 @@ class Task(TaskSpec):
       params: its `EnvParams`; the environment's `default_params` if not given.
       solved_reward, info_keys, augmented_keys: see `TaskSpec`.
       max_steps: step limit of an episode; put into `params`, or taken from there if not given.
+
+    Attributes:
       origin: plain values from which `sejax.envs.make` makes the task again. None for a task made
         by hand: whoever loads a proxy of it must pass the task.
 
@@ -61,7 +63,7 @@ class Task(TaskSpec):
     env: Environment
     params: EnvParams = None  # type: ignore[assignment]
     max_steps: int = None  # type: ignore[assignment]
-    origin: Mapping[str, object] | None = None
+    origin: Mapping[str, object] | None = field(init=False, default=None)
     observation: Space = field(init=False)  # from `env`, which `dataclasses.replace` may change
     action: Space = field(init=False)
 

@@ -155,8 +155,11 @@ def _as_gymnax(space: Space) -> Any:
 
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
-    low, high = (jnp.array(bound, jnp.float32) for bound in (space.low, space.high))
-    return spaces.Box(low, high, low.shape, jnp.float32)
+    bounds = (bound[0] if space.size == 1 else bound for bound in (space.low, space.high))
+    low, high = (
+        jnp.array(bound, jnp.float32) for bound in bounds
+    )  # gymnax's wrappers want numbers
+    return spaces.Box(low, high, (space.size,), jnp.float32)
 
 
 def _of_gymnax(space: Any, what: str) -> Space:

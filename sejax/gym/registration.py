@@ -13,7 +13,7 @@ from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWo
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
 from sejax.options import ConfigError, Count, checked, require
 from sejax.options.plain import configure
-from sejax.proxies.header import Header, pretrained_names, read
+from sejax.proxies.header import PRETRAINED_DIR, Header, pretrained_names, read
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -129,7 +129,7 @@ def register() -> list[str]:
             f"sejax/{name}",
             "sejax.gym:make",
             vector_entry_point="sejax.gym:make_vec",
-            kwargs={"source": name},
+            kwargs={"source": str(PRETRAINED_DIR / f"{name}.safetensors")},
         )
         gymnasium.registry.setdefault(spec.id, spec)
     return [f"sejax.gym:sejax/{name}" for name in pretrained_names()]

@@ -1,7 +1,7 @@
 """The real tasks behind proxies, as Gymnasium has them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -140,7 +140,10 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     fix = "Set max_steps, or wrap it in RescaleAction"
     is_same = has_limit and task.action_space == learned.action_space
     require(is_same, "task", f"{must}; {got}. {fix}.")
-    return task
+    seen, known = task.observation_space, learned.observation_space
+    must = f"must have the SE's observations, {shortened(known)}; got {shortened(seen)}."
+    require((type(seen), seen.shape) == (type(known), known.shape), "task", must)
+    return replace(task, observation_space=known)
 
 
 # --- grid worlds ----------------------------------------------------------------------------------

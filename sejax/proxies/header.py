@@ -6,6 +6,7 @@ executes, resolves and imports nothing that the file names. `sejax.proxies.io` m
 for JAX from it, and `sejax.gym` makes environments for Gymnasium.
 """
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -226,6 +227,9 @@ def read(
     is_one = len(header.proxies) == 1 or not single
     got = f"got a set in {where}. sejax.load_set reads sets"
     require(is_one, option, f"must be a single proxy; {got}.")
+    if single and header.is_set:  # a set of one
+        tensors = {name: x[0] for name, x in tensors.items()}
+        header = dataclasses.replace(header, is_set=False)
     return Stored(path, tensors, header)
 
 

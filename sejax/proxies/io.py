@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, overload
@@ -30,7 +30,7 @@ from sejax.proxies.header import Header, Stored, check_tensors
 from sejax.training import TrainingConfig
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Loaded:
     """What is common to a stored proxy and a set of them.
 
@@ -86,7 +86,7 @@ class _Loaded:
         return {key: header.configured("agent", values, where) for key, values in stored}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Proxy(_Loaded):
     """A stored proxy.
 
@@ -115,7 +115,7 @@ def fingerprint(weights: PyTree) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ProxySet(_Loaded):
     """Proxies that share a configuration, and hence every compiled program.
 
@@ -210,10 +210,13 @@ def training_of(
 ) -> TrainingConfig:
     """How long agents trained on a stored proxy when it was learned.
 
+    Another agent may begin to learn later than all agents that the proxy was learned with. Ten long
+    initial episodes, or a rollout of PPO, could use up a step budget. So the budget grows by the
+    additional wait. The number of episodes grows as much, because an episode may have one step.
+
     Args:
       proxy: the environment of `sejax.load`, or what `load_proxy` and `load_set` return.
-      agent: configuration of another agent that is to train on it; `budget_for` then adapts the
-        budget. None for the training as it was.
+      agent: configuration of another agent that is to train on it. None for the training as it was.
 
     Raises:
       ConfigError: for a proxy that is not stored, or whose file has no training.
@@ -228,41 +231,13 @@ def training_of(
     fix = "Set training=sejax.TrainingConfig(...)"
     require(isinstance(stored, Mapping), "training", f"{must}; got none. {fix}.")
     training = from_plain(TrainingConfig, stored, "training")
-    if agent is None:
+    if agent is None or training.max_steps is None:
         return training
-    agents = config["agents"].values()
-    known = [values for values in agents if header.is_registered("agent", values)]
-    learned_with = [configure("agent", values) for values in known]
-    return budget_for(training, agent, learned_with, env.max_steps, env.task.max_steps)
-
-
-def budget_for(
-    training: TrainingConfig,
-    agent: AgentConfig,
-    learned_with: Iterable[AgentConfig],
-    max_episode_steps: int,
-    task_max_steps: int,
-) -> TrainingConfig:
-    """How long an agent trains on a proxy that was learned with others.
-
-    An agent may begin to learn later than all agents that the proxy was learned with. Ten long
-    initial episodes, or a rollout of PPO, could use up a step budget. So the budget grows by the
-    additional wait. The number of episodes grows as much, because an episode may have one step.
-
-    Args:
-      training: training with which the proxy was learned.
-      agent: configuration of the agent that is to train.
-      learned_with: configurations of the agents that the proxy was learned with, as far as known.
-      max_episode_steps: step limit of the proxy's episodes.
-      task_max_steps: step limit of the real task's episodes.
-    """
-    max_steps = training.max_steps
-    if max_steps is None:
-        return training
-    limits = max_episode_steps, task_max_steps
-    waited = max((x.steps_before_learning(*limits) for x in learned_with), default=0)
+    agents, limits = config["agents"].values(), (env.max_steps, env.task.max_steps)
+    known = [configure("agent", x) for x in agents if header.is_registered("agent", x)]
+    waited = max((x.steps_before_learning(*limits) for x in known), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)
-    max_steps, max_episodes = max_steps + longer, training.max_episodes + longer
+    max_steps, max_episodes = training.max_steps + longer, training.max_episodes + longer
     return dataclasses.replace(training, max_steps=max_steps, max_episodes=max_episodes)
 
 
@@ -322,6 +297,8 @@ def save_set(
       ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
+    are_weights = weights and all(isinstance(x, Mapping) for x in weights)
+    require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
     is_known = discount is not None or not env.config.needs_discount
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(is_known, "discount", must)
@@ -330,14 +307,16 @@ def save_set(
     _require_weights("weights", tensors, env, len(records), "params.weights")
     if not is_set:
         tensors = {name: x[0] for name, x in tensors.items()}
-    known = {"proxy": to_plain(env.config, "proxy"), "run_dir": None}  # no path of this machine
-    known |= {"env": env.task.origin} if env.task.origin else {}
+    # A name that is not registered, as the registered one may make another task.
+    origin = env.task.origin or {"name": f"{env.task.name}, made by hand"}
+    known = {"proxy": to_plain(env.config, "proxy"), "env": origin}
+    known["run_dir"] = None  # no path of this machine
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            config={"env": {"name": env.task.name}, **(config or {}), **known},
+            config={**(config or {}), **known},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
@@ -513,7 +492,9 @@ def _absent_task(name: str, known: str, reason: str) -> Task:
     """
     interface, origin = json.loads(known)
     spec = TaskSpec.of_interface(interface)
-    return Task(name=name, env=AbsentEnv(spec, reason), max_steps=spec.max_steps, origin=origin)
+    task = Task(name=name, env=AbsentEnv(spec, reason), max_steps=spec.max_steps)
+    vars(task)["origin"] = origin
+    return task
 
 
 # --- gymnax ---------------------------------------------------------------------------------------
@@ -529,5 +510,6 @@ def register_gymnax() -> list[str]:
 
     ids = {f"sejax/{name}": name for name in header.pretrained_names()}
     for env_id in ids.keys() - set(registration.registered_envs):
-        registration.register(env_id, lambda name=ids[env_id]: load(name)[0])
+        path = header.PRETRAINED_DIR / f"{ids[env_id]}.safetensors"
+        registration.register(env_id, lambda path=path: load(path)[0])
     return list(ids)

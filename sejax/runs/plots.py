@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from sejax.ops.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
-AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
@@ -78,7 +77,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
             for i, (name, returns) in enumerate(parts):
                 level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
                 spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
-                color = AGENTS[kinds.index(name.partition("-")[0]) % len(AGENTS)]
+                color = f"C{kinds.index(name.partition('-')[0])}"
                 axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
                 axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
                 axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)

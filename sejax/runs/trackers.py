@@ -81,7 +81,8 @@ class GuardedTracker:
 
     def _call(self, method: str, *arguments: FinishedGeneration) -> None:
         try:
-            self._tracker = self._tracker or self._config.make(self._run)
+            if self._tracker is None:
+                self._tracker = self._config.make(self._run)
             getattr(self._tracker, method)(*arguments)
         except (Exception, SystemExit) as error:  # foreign code may raise anything
             if not self._has_failed:
