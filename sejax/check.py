@@ -129,9 +129,10 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
-    others = {x: configure("agent", {"name": x}) for x in names if x not in same}
+    others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
     myopic = dict[str, dict[str, AgentConfig]]()
-    students = learned | others | {"tuned": _tuned(task)}
+    tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
+    students = learned | others | {tuned: _tuned(task)}
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
         sighted = {
             f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
@@ -139,7 +140,8 @@ def run(config: CheckConfig) -> dict[str, Any]:
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
     config = dataclasses.replace(config, agents=students)
     on_proxy, on_task = (x._replace(is_varied=False) for x in setup_of(config)[0].values())
-    folder = Path(config.out_dir or f"runs/check-{as_file_name(Path(config.proxy).stem)}")
+    name = as_file_name(config.proxy.removesuffix(".safetensors"))
+    folder = Path(config.out_dir or f"runs/check-{name}")
     settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
@@ -150,7 +152,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
             rows[NULL] = world, [*learned, *others]
         rows[TASK] = on_task, [*learned][: None if proxy.env.is_real else 1]
         untrained = dict.fromkeys(learned, TrainingConfig(max_steps=1, max_episodes=1))
-        rows[TUNED] = on_task, ["tuned"]
+        rows[TUNED] = on_task, [tuned]
         rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
         table = _trained(config, rows, store)
         return _reported(proxy, null, [*learned], table, folder)

@@ -117,7 +117,8 @@ class EvaluateConfig(CommandConfig):
         try:
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
-                default, learned = agents.default_for(stored.spec), agents_in(stored.config)
+                default = agents.default_for(stored.spec)
+                learned = agents_in(stored.config, imports)
         except ConfigError:  # loading the proxy raises it later
             if hparams == "as_learned":
                 raise
@@ -129,17 +130,24 @@ class EvaluateConfig(CommandConfig):
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
         default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)
         names = names or {default: default}
-        of_agents = learned.get("agents", {}).values() if hparams is None else ()
-        by_name = {agent["name"]: agent for agent in of_agents}
+        known = learned.get("agents", {}) if hparams is None else {}
+        by_name = {agent["name"]: agent for agent in [*known.values()][::-1]}
         of_names = {key: by_name.get(name, {"name": name}) for key, name in names.items()}
-        return {"proxy": {"agents": of_names}}
+        same = {key: agent for key, agent in known.items() if agent["name"] == names.get(key)}
+        return {"proxy": {"agents": of_names | same}}
 
 
-def agents_in(config: Mapping[str, Any]) -> Tree:
-    """What a stored configuration says of its agents; empty if one of them is not registered."""
+def agents_in(config: Mapping[str, Any], imports: Collection[str]) -> Tree:
+    """What a stored configuration says of its agents; empty if one is neither registered nor typed.
+
+    Args:
+      config: of a proxy's file.
+      imports: each `module:attribute` that the user has typed.
+    """
     explored = config.get("exploration", {"name": "none"})
-    are_known = [header.is_registered("agent", agent) for agent in config["agents"].values()]
-    if not are_known or not all([*are_known, header.is_registered("exploration", explored)]):
+    named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
+    are_known = (header.is_registered(group, x) or x.get("name") in imports for group, x in named)
+    if not config["agents"] or not all(are_known):
         return {}
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}
@@ -235,7 +243,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
     is_varied = config.agent_hparams == "varied"
     if proxy is not None and config.agent_hparams == "as_learned":
         is_varied = proxy.config.get("agent_hparams") == "varied"
-    worlds, folder = {}, Path("runs", f"evaluate-{as_file_name(task.name)}")
+    worlds, folder = {}, Path("runs", f"evaluate-real-{as_file_name(task.name)}")
     if proxy is not None:
         worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
         folder = proxy.path.parent

@@ -92,7 +92,7 @@ def _greedy(
         )
         after = _Episode(
             active=~(terminated | env.is_truncated(env_state, params)),
-            num_steps=before.num_steps + info.get("num_steps", 1),
+            num_steps=before.num_steps + info.get("sejax_num_steps", 1),
             total=before.total + reward,
             scored=before.scored + info.get("scored_reward", reward),
             obs=obs,

@@ -95,13 +95,10 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         return
     assert training.max_steps is not None
     episodes = -(-training.max_steps // max_episode_steps)
-    require(
-        training.max_episodes >= episodes,
-        f"{name}.max_episodes",
-        f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of at "
-        f"most {max_episode_steps} steps; got {shortened(training.max_episodes)}. Set "
-        f"{name}.max_episodes={episodes}.",
-    )
+    field, got = f"{name}.max_episodes", training.max_episodes
+    must = f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of"
+    must += f" at most {max_episode_steps} steps; got {got}. Set {field}={episodes}."
+    require(got >= episodes, field, must)
 
 
 @struct.dataclass
@@ -207,19 +204,14 @@ def make_trainer(
     require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
     require_own_steps(env)
     sizes = sizes_of(*spaces_of(env))
-    require(
-        agent.spec.sizes in (None, sizes),
-        "agent",
-        f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}. "
-        "Set agent=sejax.make_agent(config, task) with that task.",
-    )
+    must = f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}"
+    fix = "Set agent=sejax.make_agent(config, task) with that task."
+    require(agent.spec.sizes in (None, sizes), "agent", f"{must}. {fix}")
     require_part("training", TrainingConfig, training)
     require_modes()
     if training.num_tests_between and test_fn is None:
-        raise ValueError(
-            f"tests after each episode (training.num_tests_between is "
-            f"{training.num_tests_between}) need a test_fn; got None."
-        )
+        number = training.num_tests_between
+        raise ValueError(f"training.num_tests_between={number} needs a test_fn; got None.")
     train = _Loop(agent, env, training, solved_reward, test_fn, keeps_stored).train
     if in_batches:
         train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
@@ -389,7 +381,7 @@ class _Loop:
                 lambda agent_state: agent_state,
                 agent_state,
             )
-        train_steps = state.train_steps + info.get("num_steps", 1)
+        train_steps = state.train_steps + info.get("sejax_num_steps", 1)
         state = dataclasses.replace(
             state,
             step=state.step + 1,

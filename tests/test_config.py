@@ -160,6 +160,18 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
 # --- preset files ---------------------------------------------------------------------------------
 
 
+def test_a_typed_choice_replaces_that_of_a_preset_file_with_its_fields(tmp_path):
+    file = tmp_path / "config.yaml"  # as a run writes it
+    learned = sejax.config(["agents=[ddqn,ppo]", "mixture.weights.ppo=2", "exploration=icm"])
+    file.write_text(yaml.safe_dump(learned.plain()))
+    assert sejax.config([f"preset={file}"]) == learned
+    typed = ["es=cma_es", "proxy=rn", "objective=auc", "exploration=none", "agents=[ddqn,sac]"]
+    config = sejax.config([f"preset={file}", *typed])
+    names = map(config.name, ("es", "proxy", "objective", "exploration", "agent"))
+    assert [*names] == ["cma_es", "rn", "auc", "none", "ddqn+sac"]
+    assert not sejax.config([f"preset={file}", "agent=ddqn"]).mixture.weights
+
+
 def test_a_preset_file_stands_for_its_overrides(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("env: acrobot\npreset: paper\nes:\n  noise_std: 0.05\nagent.batch_size: 3\n")

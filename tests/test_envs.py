@@ -290,7 +290,7 @@ def test_a_decision_is_three_steps_or_as_many_as_the_episode_has_left(start):
     while num_steps < 3 and state.time < 10:
         obs, state, step_reward, _, _ = task.env.step_env(KEY, state, 1, params)
         total, num_steps = total + step_reward, num_steps + 1
-    assert info["num_steps"] == num_steps == min(3, 10 - start)
+    assert info["sejax_num_steps"] == num_steps == min(3, 10 - start)
     assert reward == total and not terminated
     assert env.is_truncated(repeated, params) == (start + num_steps >= 10)
     np.testing.assert_allclose(env.get_obs(repeated), obs, rtol=1e-6)
@@ -302,7 +302,7 @@ def test_nothing_happens_after_an_episode_has_terminated():
     _, state = task.env.reset_env(KEY, task.params)
     state = state.replace(position=jnp.float32(0.449), velocity=jnp.float32(0.05))
     _, end, reward, terminated, info = env.step_env(KEY, state, jnp.ones(1), task.params)
-    assert terminated and info["num_steps"] == 1 and reward == pytest.approx(100 - 0.1)
+    assert terminated and info["sejax_num_steps"] == 1 and reward == pytest.approx(100 - 0.1)
     assert end.position == pytest.approx(0.449 + 0.05, abs=3e-3)  # one step further, not four
 
 

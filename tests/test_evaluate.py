@@ -193,6 +193,27 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     assert worlds["the proxy"].trainings == {"q_learning": config.real_training}
 
 
+def test_agents_that_are_named_have_the_hyperparameters_of_the_run(tmp_path, monkeypatch):
+    """Also plugins that the user types, and the right one of two agents of one name."""
+    (tmp_path / "own_agent.py").write_text(
+        "from dataclasses import dataclass\nfrom sejax import DDQNConfig\n"
+        "@dataclass(frozen=True, kw_only=True)\nclass Own(DDQNConfig):\n    tau: float = 0.5\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["env=cartpole", "agents=[ddqn,own_agent:Own]", "agents.own_agent_Own.tau=0.03"]
+    path = save(tmp_path / "mixed.safetensors", *words)
+    config = evaluate_config(f"proxy={path}", words[1])
+    assert config.agents["own_agent_Own"].tau == 0.03
+    words = [
+        "agents=[ddqn]",
+        "agents.tuned.name=ddqn",
+        "agents.tuned.tau=0.7",
+        "agents.ddqn.tau=0.2",
+    ]
+    path = save(tmp_path / "twice.safetensors", "env=cartpole", *words)
+    assert evaluate_config(f"proxy={path}", "agent=ddqn").agent.tau == 0.2
+
+
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     config, proxies = learned(*ROOM_SE)[0], sejax.load_set(room)
     for group in ("agent", "exploration", "es", "objective"):

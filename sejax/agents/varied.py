@@ -49,8 +49,8 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
     cls, hints = type(config), get_type_hints(type(config))
     names = [field.name for field in dataclasses.fields(config)]
     how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
-    must = f"must be default with {cls.__name__}, which varies nothing, or no num_layers"
-    is_whole = bool(how) and ("num_layers" in how or "hidden_size" not in how)
+    must = f"must be default with {cls.__name__}, which varies nothing or half a network"
+    is_whole = bool(how) and ("num_layers" in how) == ("hidden_size" in how)
     require(is_whole, "agent_hparams", f"{must}; got varied. Set agent_hparams=default.")
     # Traced options first: the order decides which key draws which option.
     ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])

@@ -50,7 +50,7 @@ class Wrapper(Environment[State, Params]):
 class ActionRepeat(Wrapper[EnvState, EnvParams]):
     """An environment in which each decision lasts `num_repeats` steps, or to the episode's end.
 
-    Rewards add up undiscounted, and `info["num_steps"]` says how many steps were made. State,
+    Rewards add up undiscounted, and `info["sejax_num_steps"]` says how many steps were made. State,
     parameters and spaces are the wrapped environment's.
 
     Source: paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3" (number of action
@@ -75,7 +75,7 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
             total = total + jnp.where(ended, 0.0, reward)
             num_steps = num_steps + ~ended
             ended = terminated | self.env.is_truncated(state, params) | info.get("nonfinite", False)
-        return obs, state, total, terminated, {**info, "num_steps": num_steps}
+        return obs, state, total, terminated, {**info, "sejax_num_steps": num_steps}
 
 
 @cache
@@ -124,7 +124,7 @@ class PartlyScored(Wrapper[PartState, PartParams]):
             key, state.world, action, self._with_limit(until)
         )
         scored = jnp.where(state.time < params.scored_steps, reward, 0.0)
-        state = PartState(time=state.time + info.get("num_steps", 1), world=world)
+        state = PartState(time=state.time + info.get("sejax_num_steps", 1), world=world)
         reward = jnp.where(is_within, reward, 0.0)
         return obs, state, reward, terminated, {**info, "scored_reward": scored}
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from sejax.es.base import NumMembers, Scale, Strategy, StrategyOptions
 from sejax.es.score_transforms import FIELD, TRANSFORMS, OwnTransform, transform_of
 from sejax.ops.scores import or_minus_inf
-from sejax.options import Count, Decay, Fraction, option, registry, require_known
+from sejax.options import LEAST, Count, Decay, Fraction, option, registry, require_known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,8 @@ class NESConfig(StrategyOptions):
             weights = transform(scores, incumbent_score)
             step = state.step_size * weights @ noise
             if self.update_rule == "paper":
-                step = step / (num_noises * state.noise_std)
+                # After many generations a decaying std is 0 in 32 bits.
+                step = step / (num_noises * jnp.maximum(state.noise_std, LEAST))
             return dataclasses.replace(
                 state,
                 mean=(1 - self.weight_decay) * state.mean + step,

@@ -15,6 +15,7 @@ from sejax import envs
 from sejax.envs.spec import Discrete, Space, TaskSpec
 from sejax.options import require, shortened
 from sejax.options.plain import configure, to_plain
+from sejax.options.registry import BUILT_IN
 from sejax.proxies.header import Header
 from sejax.proxies.synthetic import SyntheticConfig
 
@@ -26,13 +27,7 @@ GYMNASIUM_IDS = {
     "mountain_car": "MountainCar-v0",
     "mountain_car_continuous": "MountainCarContinuous-v0",
     "pendulum": "Pendulum-v1",
-    "halfcheetah": "HalfCheetah-v5",
-    "hopper": "Hopper-v5",
-    "walker2d": "Walker2d-v5",
-    "swimmer": "Swimmer-v5",
-    "inverted_pendulum": "InvertedPendulum-v5",
-    "ant": "Ant-v5",
-    "reacher": "Reacher-v5",
+    **{name: f"{x.partition(':')[2]}-v5" for name, x in BUILT_IN["env"].items() if "mujoco" in x},
 }
 GRIDS = ("cliff_walking", "gridworld_2x2")
 

@@ -6,7 +6,7 @@ any number of devices (`tests/test_parallel.py`).
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,8 @@ def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-def _strongly_typed(x: Array) -> Array:
+def _strongly_typed(x: Any) -> Array:
+    x = jnp.asarray(x)
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
@@ -110,11 +111,8 @@ def spread_groups_over_devices(
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
     available = jax.devices()
-    require(
-        num_devices is None or num_devices <= len(available),
-        "devices",
-        f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null.",
-    )
+    must = f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null."
+    require(num_devices is None or num_devices <= len(available), "devices", must)
     mesh = _mesh(num_devices)
     widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 

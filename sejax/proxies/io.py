@@ -309,8 +309,8 @@ def save_set(
         tensors = {name: x[0] for name, x in tensors.items()}
     # A name that is not registered, as the registered one may make another task.
     origin = env.task.origin or {"name": f"{env.task.name}, made by hand"}
-    known = {"proxy": to_plain(env.config, "proxy"), "env": origin}
-    known["run_dir"] = None  # no path of this machine
+    # `run_dir` would be a path of this machine.
+    known = {"proxy": to_plain(env.config, "proxy"), "env": origin, "run_dir": None}
     try:
         stored = Header(
             format_version=header.FORMAT_VERSION,

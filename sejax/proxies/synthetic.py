@@ -245,8 +245,8 @@ class SyntheticEnv(ProxyEnv):
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self.config.initial_state == "real":
             vector, _ = self.task.env.reset_env(key, self.task.params)
-            if self.task.num_states is not None:
-                vector = jax.nn.one_hot(vector, self.task.num_states)
+            count = self.task.num_states
+            vector = jnp.float32(vector) if count is None else jax.nn.one_hot(vector, count)
         else:
             vector = noise = jax.random.normal(key, (self.task.obs_dim,))
             if self.config.initial_state == "learned":

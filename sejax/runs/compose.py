@@ -108,23 +108,35 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
       {'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}
     """
     texts: Tree = {name: unquoted(text) for name, text in words(overrides).items()}
-    file: Tree = {}
-    if texts.get("preset", "").endswith(".yaml"):
-        path = Path(expanded(texts.pop("preset")))
-        try:
-            values = flatten(header.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
-            file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
-        except UNREADABLE as error:
-            got = f"{shortened(path, 40)} ({told(error)})"
-            must = f"preset must be a name, or a YAML file of fields; got {got}. Set preset=best."
-            raise ConfigError(must, "preset") from error
-    typed = _tree(texts, groups)
-    named = file.get("agents", {})
+    if not texts.get("preset", "").endswith(".yaml"):
+        return _tree(texts, groups)
+    path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
+    try:
+        values = flatten(header.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
+        file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
+        return merge(_beside(file, typed, groups), typed)
+    except UNREADABLE as error:
+        got = f"got {shortened(path, 40)} ({told(error)})"
+        must = f"preset must be a name, or a YAML file of fields; {got}. Set preset=best."
+        raise ConfigError(must, "preset") from error
+
+
+def _beside(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
+    """The tree of a file without what typed choices replace: other choices' fields, and agents."""
+    for group in groups:
+        name = typed.get(group, {}).get("name")
+        if name is not None and file.get(group, {}).get("name", name) != name:
+            del file[group]
+    named = file["agents"]
     if len(named) == 1:
         file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
-    if names := names_of(typed["agents"]):  # they replace the file's agents
+    if names := names_of(typed["agents"]):
         file["agents"] = {key: x for key, x in named.items() if key in names}
-    return merge(file, typed)
+        mixture = dict(file.pop("mixture", {}))
+        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in names}
+        if len(names) > 1:
+            file["mixture"] = mixture | {"weights": weights}
+    return file
 
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:

@@ -1,5 +1,6 @@
 """Lines of progress, and the final message of `sejax.run`."""
 
+import shlex
 import time
 
 from sejax.bilevel import Bilevel
@@ -67,6 +68,7 @@ class RunProgress:
         agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
         env, proxy = to_plain(self._config.env, "env"), self._config.name("proxy")
         named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
+        named["exploration"] = self._config.name("exploration")
         words = "".join(f" {name}={text}" for name, text in named.items() if ":" in text)
         fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
@@ -78,7 +80,7 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             "Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate proxy={path}{words} num_agents=20\n"
+            f"  python -m sejax.evaluate {shlex.quote(f'proxy={path}')}{words} num_agents=20\n"
             "Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{arguments})'
         )

@@ -18,7 +18,7 @@ REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.
 SET_BY_SEARCH = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
 # Names, and fields that may differ between the workers of a study and between its sessions.
-FREE = ("trials", "search_dir", "verify", "fresh_seeds", "study", "space", "devices")
+FREE = ("trials", "search_dir", "verify", "fresh_seeds", "space", "devices")
 
 
 @dataclass(frozen=True, kw_only=True)
