@@ -1,5 +1,6 @@
 """sejax.es: the paper's NES against NumPy, and the contract of every outer optimiser."""
 
+import dataclasses
 import functools
 
 import jax
@@ -170,6 +171,16 @@ def test_diverged_scores_never_reach_the_mean():
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
     np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_std_that_has_decayed_to_nothing_moves_nothing():
+    key, strategy = jax.random.key(0), NESConfig(update_rule="paper", population_size=4).make(DIMS)
+    state = strategy.init(key, jnp.array(MEAN))
+    state = dataclasses.replace(state, noise_std=jnp.float32(0))
+    candidates, state = strategy.ask(key, state)
+    scores = jnp.arange(float(len(candidates)))
+    state = strategy.tell(key, candidates, scores, jnp.float32(0), state)
+    np.testing.assert_array_equal(state.mean, MEAN)
 
 
 # --- contract of every strategy ------------------------------------------------------------------

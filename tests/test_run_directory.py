@@ -170,7 +170,7 @@ def test_a_column_that_an_older_version_did_not_write_is_nan(run, monkeypatch):
 # --- files beside the checkpoint, and without it -------------------------------------------------
 
 
-@pytest.mark.parametrize("kept", ["metrics.csv", "proxy.safetensors", "checkpoint"])
+@pytest.mark.parametrize("kept", ["metrics.csv", "config.yaml", "proxy.safetensors", "checkpoint"])
 def test_files_of_a_run_without_its_checkpoint_are_not_replaced(tmp_path, kept):
     (tmp_path / kept).write_bytes(b"precious")
     assert kept in refused(tmp_path)

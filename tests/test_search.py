@@ -205,6 +205,10 @@ def test_the_preset_file_makes_the_settings_of_the_command(tmp_path):
     best = configuration.config(shlex.split(line)[3:])
     assert configuration.config([f"preset={tmp_path}/preset.yaml"]) == best
     assert best.es.noise_std == 0.25 and best.preset == "paper" and best.agent.batch_size == 16
+    several = [SPACE, f"search_dir={tmp_path}", "agents=[ddqn,ppo]", "agents.ppo.hidden_size=8"]
+    line = study.write_best(["es.noise_std=0.25"], search_config.read(several))
+    best = configuration.config(shlex.split(line)[3:])
+    assert configuration.config([f"preset={tmp_path}/preset.yaml"]) == best
 
 
 def test_the_best_of_those_that_are_tried_again_is_the_result(tmp_path, learning, capsys):
