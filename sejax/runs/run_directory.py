@@ -37,7 +37,7 @@ _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
 # A killed session may leave temporaries of these files.
 _WRITTEN = ("*.safetensors", _METRICS, _CONFIG, "learning_curve.png", "run.json")
-# Files that only a run writes. Without a checkpoint an older sejax wrote them, or it was lost.
+# Files that a run would replace. Without a checkpoint they are not its own, or it was lost.
 _SIGNS_OF_A_RUN = (_METRICS, _CONFIG, "run.json", "proxy.safetensors", "checkpoint")
 State = TypeVar("State")
 
