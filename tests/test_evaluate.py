@@ -195,15 +195,15 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
 
 def test_agents_that_are_named_have_the_hyperparameters_of_the_run(tmp_path, monkeypatch):
     """Also plugins that the user types, and the right one of two agents of one name."""
-    (tmp_path / "own_agent.py").write_text(
+    (tmp_path / "typed_agent.py").write_text(
         "from dataclasses import dataclass\nfrom sejax import DDQNConfig\n"
         "@dataclass(frozen=True, kw_only=True)\nclass Own(DDQNConfig):\n    tau: float = 0.5\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    words = ["env=cartpole", "agents=[ddqn,own_agent:Own]", "agents.own_agent_Own.tau=0.03"]
+    words = ["env=cartpole", "agents=[ddqn,typed_agent:Own]", "agents.typed_agent_Own.tau=0.03"]
     path = save(tmp_path / "mixed.safetensors", *words)
     config = evaluate_config(f"proxy={path}", words[1])
-    assert config.agents["own_agent_Own"].tau == 0.03
+    assert config.agents["typed_agent_Own"].tau == 0.03
     words = [
         "agents=[ddqn]",
         "agents.tuned.name=ddqn",
