@@ -112,8 +112,9 @@ def test_a_changed_row_of_an_experiment_is_found(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_the_documents_of_this_project_pass():
-    """Its tables are made again: that takes most of a minute."""
+    """As `make claims`: its tables are made again, which takes most of a minute."""
     assert list(claims.Claims.read(claims.ROOT).check()) == []
 
 

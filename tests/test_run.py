@@ -277,7 +277,9 @@ def test_a_killed_run_goes_on_to_the_same_numbers(uninterrupted, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
     words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
     ended = process(sys.executable, "-c", DRIVER, number.name, *words)
