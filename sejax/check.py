@@ -185,7 +185,8 @@ def _null(
     (lesson,), costs = searched(search, task, 1, keys, store, config.devices)
     method, steps = "a random search", costs["real_steps"].sum()
     if lesson.policy_return < task.solved_reward:
-        (other,), costs = copied(CopyConfig(agent_steps=config.null_steps), task, "ppo", keys)
+        how = CopyConfig(agent_steps=config.null_steps)
+        (other,), costs = copied(how, task, "ppo", keys, store)
         steps += costs["real_steps"].sum()
         method, lesson = max(((method, lesson), ("a PPO", other)), key=lambda x: x[1].policy_return)
     env, weights = make_exact(task, lesson.layers, lesson.states)

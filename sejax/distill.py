@@ -170,7 +170,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
         lessons, costs = searched(job.search, task, job.num_snapshots, keys, store, config.devices)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
-        lessons, costs = copied(job.copy, task, job.policy, keys)
+        lessons, costs = copied(job.copy, task, job.policy, keys, store)
     store.put(CHECKPOINT)
     ses = [make_exact(task, x.layers, x.states, job.independent_starts) for x in lessons]
     best, rows = 0, pd.DataFrame()

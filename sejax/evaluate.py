@@ -8,6 +8,7 @@ By default they are the agents that the proxy was learned with; agent=NAME takes
 Writes evaluation.csv and .json into out_dir. --print-config prints the configuration alone.
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -104,8 +105,8 @@ class EvaluateConfig(CommandConfig):
         default one trains.
 
         Raises:
-          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words name agents, or
-            if the file does not tell its agents.
+          ConfigError: without a proxy; for agents of the proxy that are neither registered nor
+            typed; with `agent_hparams=as_learned`, if words name agents, or if the file has none.
         """
         fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
         require("proxy" in typed, "proxy", f"must be given. {fix}")
@@ -113,18 +114,17 @@ class EvaluateConfig(CommandConfig):
         is_clear = not names or hparams != "as_learned" or typed["proxy"] == "real"
         must = f"must be left out with agent_hparams=as_learned; got {', '.join(names)}"
         require(is_clear, "agents", f"{must}. Set agent_hparams=default.")
+        is_learned = not names and hparams in (None, "as_learned")
         stored, learned, default = None, Tree(), ""
-        try:
+        with contextlib.suppress(ConfigError):  # loading the proxy raises it later
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
                 default = agents.default_for(stored.spec)
-                learned = agents_in(stored.config, imports)
-        except ConfigError:  # loading the proxy raises it later
-            if hparams == "as_learned":
-                raise
-        must = "must be left out for a proxy whose file tells no agents that sejax knows"
-        require(learned or not stored or hparams != "as_learned", "agent_hparams", f"{must}.")
-        if learned and not names and hparams in (None, "as_learned"):
+        if stored:
+            learned = agents_in(stored.config, imports, is_learned)
+            must = "must be left out for a proxy whose file has no agents"
+            require(learned or hparams != "as_learned", "agent_hparams", f"{must}.")
+        if learned and is_learned:
             if "name" in typed.get("exploration", {}):
                 del learned["exploration"]
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
@@ -137,17 +137,23 @@ class EvaluateConfig(CommandConfig):
         return {"proxy": {"agents": of_names | same}}
 
 
-def agents_in(config: Mapping[str, Any], imports: Collection[str]) -> Tree:
-    """What a stored configuration says of its agents; empty if one is neither registered nor typed.
+def agents_in(config: Mapping[str, Any], imports: Collection[str], is_learned: bool) -> Tree:
+    """What a stored configuration says of its agents; empty if one is not known.
 
     Args:
       config: of a proxy's file.
       imports: each `module:attribute` that the user has typed.
+      is_learned: whether these agents are to train.
+
+    Raises:
+      ConfigError: if one that is to train is neither registered nor typed.
     """
     explored = config.get("exploration", {"name": "none"})
     named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
-    are_known = (header.is_registered(group, x) or x.get("name") in imports for group, x in named)
-    if not config["agents"] or not all(are_known):
+    unknown = [(group, x) for group, x in named if not header.is_registered(group, x)]
+    for group, x in unknown:
+        registry.require_typed(group, str(x.get("name")), imports if is_learned else None)
+    if not config["agents"] or any(x.get("name") not in imports for _, x in unknown):
         return {}
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}

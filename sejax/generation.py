@@ -117,9 +117,9 @@ class GenerationEvaluator:
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
-            of_agent = keys.population[numbers].ravel(), keys.incumbent[:, agent_index]
+            of_population = jnp.concatenate(keys.population[numbers])  # old keys have an axis more
             trainings = Trainings(
-                key=jnp.concatenate(of_agent),
+                key=jnp.concatenate([of_population, keys.incumbent[:, agent_index]]),
                 candidate=jnp.concatenate([population, incumbent]),
                 active=active,
                 test_params=test_params,

@@ -6,7 +6,7 @@
 The same command resumes a stopped study, or adds a worker to a running one. Values to search are
 choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)) and tag(log, ...);
 tag(log, inverse, ...) is logarithmic in 1 - x. All other overrides than the fields below go to
-python -m sejax.run.
+python -m sejax.run, also those of preset=FILE.yaml, but for its generations, seeds and folders.
 """
 
 from collections.abc import Sequence

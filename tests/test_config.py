@@ -173,7 +173,7 @@ def test_a_typed_choice_replaces_that_of_a_preset_file_with_its_fields(tmp_path)
 
 
 def test_a_preset_file_stands_for_its_overrides(tmp_path):
-    file = tmp_path / "mine.yaml"
+    file = tmp_path / "mine.yml"
     file.write_text("env: acrobot\npreset: paper\nes:\n  noise_std: 0.05\nagent.batch_size: 3\n")
     words = ["env=acrobot", "preset=paper", "es.noise_std=0.05", "agent.batch_size=7"]
     assert sejax.config([f"preset={file}", words[-1]]) == sejax.config(words)
@@ -237,6 +237,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("stop_when_solved=maybe", "stop_when_solved", ""), ("agents=[ddqn,ddqn]", "agents", ""),
     ("agents=[ddqn,ppo] mixture.weights.ddqn=0 mixture.weights.ppo=0", "mixture.weights", ""),
     ("agents=[ddqn,ppo] mixture.weights.ddqn=-1", "mixture.weights.ddqn", ""),
+    ("agents=[ddqn,ppo] mixture.weights.ddq=2", "mixture.weights.ddq", "mixture.weights.ddqn?"),
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
     ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps",

@@ -118,8 +118,14 @@ def test_a_function_that_has_changed_gets_students_of_its_own(tmp_path, monkeypa
     assert len(list((tmp_path / "students").iterdir())) == 2
 
 
-def test_an_agent_is_trained_and_its_steps_are_counted(tmp_path):
-    main([*QUICK, "policy=ddqn", "copy.agent_steps=200", f"run_dir={tmp_path}"])
+def test_an_agent_is_trained_once_and_its_steps_are_counted(tmp_path, monkeypatch):
+    words = [*QUICK, "policy=ddqn", "copy.agent_steps=200", f"run_dir={tmp_path}"]
+    main(words)
+    monkeypatch.setattr(policies, "make_trainer", lambda *_: pytest.fail("it trains again"))
+    first = sejax.load_proxy(tmp_path).fingerprint
+    (tmp_path / "proxy.safetensors").unlink()
+    main(words)
+    assert sejax.load_proxy(tmp_path).fingerprint == first
     shown, rows = zoo.describe(header.read(tmp_path)), pd.read_csv(tmp_path / "students.csv")
     assert shown.learning.real_steps > 200 + 2 * shown.policy_return + rows["real_steps"].sum()
 

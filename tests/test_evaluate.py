@@ -104,7 +104,7 @@ def budget_for(training, agent, learned_with, length):
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
-    then, training = proxy.learned_with("agent"), sejax.training_of(proxy)
+    (then,), training = proxy.learned_agents().values(), sejax.training_of(proxy)
     waits = dataclasses.replace(then, warmup_episodes=3)
     long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
     for agent, learned_with, length, budget in (
@@ -136,7 +136,6 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
     assert setup_of(as_learned)[0]["the proxy"].trainings["ppo"].max_steps == 4000
-    assert refused(sejax.load_proxy(path).learned_with, "agent") == "agent"
 
 
 @pytest.mark.parametrize(("proxy", "words", "field"), [
@@ -216,12 +215,14 @@ def test_agents_that_are_named_have_the_hyperparameters_of_the_run(tmp_path, mon
 
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     config, proxies = learned(*ROOM_SE)[0], sejax.load_set(room)
-    for group in ("agent", "exploration", "es", "objective"):
+    assert proxies.learned_agents() == config.agents
+    for group in ("exploration", "es", "objective"):
         assert proxies.learned_with(group) == getattr(config, group)
     bare = tmp_path / "bare.safetensors"
-    for stored in ({}, {"agent": {"name": "my:Agent"}}):
-        sejax.save(bare, proxies.env, proxies[0].params.weights, stored)
-        assert refused(sejax.load_proxy(bare).learned_with, "agent") == "agent"
+    sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
+    assert refused(sejax.load_proxy(bare).learned_agents) == "agent"
+    assert refused(evaluate_config, f"proxy={bare}") == "agent"  # no other agent takes its place
+    assert list(evaluate_config(f"proxy={bare}", "agent=sarsa").agents) == ["sarsa"]
     assert "my" not in sys.modules
 
 

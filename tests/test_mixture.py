@@ -172,6 +172,12 @@ def two():
     )  # fmt: skip
 
 
+def test_keys_may_be_of_the_old_kind(two):
+    generation = jax.jit(lambda key: two.bilevel.generations(two.bilevel.init(key), 1)[1])
+    old, new = (generation(key) for key in (jax.random.PRNGKey(3), jax.random.key(3)))
+    assert_equal(old, new)
+
+
 def test_each_candidate_is_trained_by_its_agent_and_no_other(two):
     assert_equal(two.outcome, two.expected)
 

@@ -20,6 +20,7 @@ from sejax.distillation.policy_search import (
     with_moments,
 )
 from sejax.distillation.teaching import grades
+from sejax.runs.store import Store
 
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
 SMALL = SearchConfig(num_directions=6, num_top=3, generations=10, num_tests=4)
@@ -120,9 +121,10 @@ def balances(obs):
     ("task", "policy", "hidden_size", "most"),
     [(PENDULUM, swings_up, 8, 0.2), (CARTPOLE, balances, 0, 0.4)],
 )
-def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most):
+def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most, tmp_path):
     config = dataclasses.replace(COPY, hidden_size=hidden_size)
-    (lesson,), costs = copied(config, task, f"{__name__}:{policy.__name__}", KEYS)
+    store, name = Store(tmp_path, {}), f"{__name__}:{policy.__name__}"
+    (lesson,), costs = copied(config, task, name, KEYS, store)
     assert len(lesson.layers) == 1 + (hidden_size > 0)
     error = acting(task, lesson.layers)(lesson.states) - policy(lesson.states)
     assert np.sqrt((error**2).mean()) < most

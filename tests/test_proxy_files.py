@@ -66,7 +66,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     known |= {"agents": {"q_learning": CONFIG["agent"]}, "preset": "best"}  # today's form
     assert proxy.config == known | {"run_dir": None}  # no path of a machine
     assert header.read(path).header.config == proxy.config
-    assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
+    assert proxy.learned_agents() == {"q_learning": sejax.QLearningConfig(discount=0.7)}
     assert refused(proxy.learned_with, "training") == "group"
     own = {"agents": {"mine": {"name": "my:Agent", "weight": 3}}}  # an own agent's own field
     assert header.upgraded(own) == own
@@ -78,7 +78,7 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     proxy, proxies = sejax.load_proxy(path), sejax.load_set(path)
     assert proxy.record == {} and proxy.params.discount == 0.7
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
-    assert refused(proxy.learned_with, "agent") == "agent"
+    assert proxy.learned_agents() == {} and refused(proxy.learned_with, "es") == "es"
     assert refused(sejax.training_of, proxy) == "training"
     sejax.save(path, env, weights[1], {"training": {"max_steps": 7}}, 0.7)  # without the field
     assert sejax.training_of(sejax.load_proxy(path)).time_limit_is_terminal

@@ -188,6 +188,11 @@ def test_a_study_is_of_one_search(tmp_path):
         assert refused(opened, tmp_path, *overrides, other) == "search_dir"
 
 
+def test_a_folder_may_have_any_name(tmp_path):
+    opened(tmp_path / "what? #1%20")
+    assert (tmp_path / "what? #1%20" / "study.db").exists() and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_database_that_is_none_is_refused(tmp_path):
     (tmp_path / "study.db").write_bytes(b"no database" * 100)
     assert refused(command.main, [SPACE, f"search_dir={tmp_path}"]) == "search_dir"

@@ -113,10 +113,8 @@ class Mixture:
             hands[int(np.argmax(behind))].append(candidate)
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         field, size = "es.population_size", 2 * max(num_dealt, self.size)
-        got = (
-            f"{num_dealt} perturbations for weights {shortened(self.weights)}. Set {field}={size}."
-        )
-        require(are_enough, field, f"must leave each agent a candidate; got {got}")
+        got = f"got {num_dealt} perturbations for weights {shortened(self.weights)}"
+        require(are_enough, field, f"must leave each agent one; {got}. Set {field}={size}.")
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 

@@ -26,11 +26,12 @@ from jaxtyping import Array, PyTree
 
 from sejax import options
 from sejax.agents import make_agent
-from sejax.distillation.policy_search import Lesson, random_map
+from sejax.distillation.policy_search import Arrays, Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import ConfigError, Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import configure
 from sejax.proxies.exact import Layer, evaluate, require_vectors
+from sejax.runs.store import Store
 from sejax.training import TrainingConfig, make_trainer
 
 # Observations [state, obs_dim] to actions [state] or [state, action_dim], of NumPy.
@@ -141,7 +142,7 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
 
 
 def copied(
-    config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]
+    config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array], store: Store
 ) -> tuple[list[Lesson], pd.DataFrame]:
     """The copy of a policy as the only lesson, and a row of its costs: `real_steps` and `cpu_s`.
 
@@ -150,8 +151,19 @@ def copied(
       task: the real task.
       policy: see `policy_of`.
       keys: `search`, for training an agent; `record`, for episodes, errors and fits.
+      store: where the copy of an agent is kept; the code of a function or a model may change.
     """
     require_vectors(task)
+    compute = functools.partial(_copy, config, task, policy, keys)
+    found = store.once("copy", compute) if registry.is_registered("agent", policy) else compute()
+    kernels, biases = ([found[x] for x in sorted(found) if y in x] for y in ("kernel", "bias"))
+    layers, policy_return = [*zip(kernels, biases, strict=True)], found["policy_return"].item()
+    costs = pd.DataFrame({name: [found[name].item()] for name in ("real_steps", "cpu_s")})
+    return [Lesson(0, layers, found["states"], policy_return)], costs
+
+
+def _copy(config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]) -> Arrays:
+    """The copy's layers, the states that the policy visits, its return, and the costs, by name."""
     started, key = time.process_time(), keys["record"]
     act = policy_of(policy, task, config.agent_steps, keys["search"])
     # One key is unused: without it the numbers of stored proxies would change.
@@ -171,8 +183,11 @@ def copied(
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
     agent_steps = config.agent_steps * registry.is_registered("agent", policy)
     real_steps = len(states) + len(tested) + agent_steps
-    costs = {"real_steps": [real_steps], "cpu_s": [time.process_time() - started]}
-    return [Lesson(0, layers, policy_states, policy_return)], pd.DataFrame(costs)
+    costs = {"real_steps": real_steps, "cpu_s": time.process_time() - started}
+    found = costs | {"states": policy_states, "policy_return": policy_return}
+    for i, (kernel, bias) in enumerate(layers):
+        found |= {f"kernel{i}": kernel, f"bias{i}": bias}
+    return {name: np.asarray(value) for name, value in found.items()}
 
 
 def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:

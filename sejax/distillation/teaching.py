@@ -17,7 +17,7 @@ from jaxtyping import Array, PyTree
 
 from sejax.agents import make_agent
 from sejax.agents.base import Agent
-from sejax.distillation.policy_search import Lesson
+from sejax.distillation.policy_search import Arrays, Lesson
 from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
@@ -61,9 +61,7 @@ def students(
     return pd.concat(tables, ignore_index=True)
 
 
-def teach(
-    ses: Sequence[SE], agent: Agent, config: LearnConfig, keys: Array
-) -> dict[str, np.ndarray]:
+def teach(ses: Sequence[SE], agent: Agent, config: LearnConfig, keys: Array) -> Arrays:
     """Trains fresh agents on each SE and tests them on the real task.
 
     Args:

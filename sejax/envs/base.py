@@ -106,19 +106,18 @@ class Task(TaskSpec):
 
 
 def require_own_steps(env: Environment) -> None:
-    """Checks that an environment is no wrapper of gymnax's kind.
+    """Checks that it is an environment, and no wrapper of gymnax's kind.
 
     Such a wrapper changes `step`, but its `step_env` is that of the environment in it. sejax calls
     `step_env`, so it would silently leave the wrapper out.
 
     Raises:
-      ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`.
+      ConfigError: for a class without `step_env` or `reset_env`.
     """
-    methods = dir(type(env))
-    is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
-    fix = f"got {type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper"
-    must = f"must change reset_env and step_env in place of reset and step; {fix}."
-    options.require(is_whole, "env", must)
+    must = f"must have reset_env and step_env, as gymnax's have; got {type(env).__name__}"
+    fix = "Derive a wrapper from sejax.envs.wrappers.Wrapper; of a task pass task.env"
+    is_whole = {"reset_env", "step_env"} <= {*dir(type(env))}
+    options.require(is_whole, "env", f"{must}. {fix}.")
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:

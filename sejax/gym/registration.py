@@ -78,7 +78,8 @@ def make_vec(
       >>> obs.shape, envs.metadata["autoreset_mode"].value
       ((8, 4), 'NextStep')
     """
-    _, world = _read(source, task, num_envs)
+    _, world = _read(source, task)
+    num_envs = checked([num_envs], Count, "num_envs", 8)
     if world is None:
         env_fns = [partial(make, source, task)] * num_envs
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
@@ -106,7 +107,8 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     except ImportError as error:
         message = f"make_sb3 needs Stable-Baselines3; got {error}. Type pip install 'sejax[sb3]'."
         raise ConfigError(message) from error
-    _, world = _read(source, task, num_envs)
+    _, world = _read(source, task)
+    num_envs = checked([num_envs], Count, "num_envs", 8)
     if world is None:
         return DummyVecEnv([partial(make, source, task)] * num_envs)
     return SyntheticVecEnv(world, num_envs)
@@ -135,15 +137,12 @@ def register() -> list[str]:
     return [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
 
 
-def _read(
-    source: Source, task: RealTask | str | None, num_envs: int = 1
-) -> tuple[Header, SyntheticWorld | None]:
+def _read(source: Source, task: RealTask | str | None) -> tuple[Header, SyntheticWorld | None]:
     """The header of a file, and its SE, or None for an RN.
 
     Raises:
       ConfigError: as `make`.
     """
-    checked([num_envs], Count, "num_envs", 8)
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         message = "must be an id of Gymnasium for an RN; got a RealTask. Set task=ID."

@@ -62,7 +62,7 @@ def to_plain(value: object, group: str | None = None) -> Any:
         return {str(key): to_plain(x, group) for key, x in value.items()}
     if hasattr(value, "tolist") and not isinstance(value, type):  # arrays of NumPy and jax
         return value.tolist()
-    return value
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def plugin(group: str) -> Any:

@@ -48,11 +48,6 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
     return repo, revision, file or FILE
 
 
-def is_repo(repo: object) -> bool:
-    """Whether it is `USER/REPO`."""
-    return re.fullmatch(_REPO, str(repo), re.ASCII) is not None
-
-
 def fetch(address: str, option: str = "source") -> Path:
     """The local copy of a file on the Hub, downloaded if there is none or it has changed.
 

@@ -52,25 +52,20 @@ class _Loaded:
         return self.env.task
 
     def learned_with(self, group: str) -> Any:
-        """A part of the configuration that it was learned with, such as `agent` or `es`.
+        """A part of the configuration that it was learned with, such as `es`.
 
-        For its training see `sejax.training_of`.
+        For its agents see `learned_agents`, for its training `sejax.training_of`.
 
         Raises:
           ConfigError: for an unknown part, and if the file lacks the part, or names one that is not
             registered, because a file's names are never imported.
 
         Example:
-          >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
-          0.8
+          >>> load_proxy("cliff_walking-rn").learned_with("es").population_size
+          16
         """
-        require_known("group", group, registry.GROUPS)
-        if group != "agent":
-            return header.configured(group, self.config.get(group), self.path.name)
-        agents = self.learned_agents()
-        got = f"got {', '.join(agents) or 'none'}. Take learned_agents()"
-        require(len(agents) == 1, "agent", f"must be the only one; {got}.")
-        return next(iter(agents.values()))
+        require_known("group", group, registry.GROUPS.keys() - {"agent"})
+        return header.configured(group, self.config.get(group), self.path.name)
 
     def learned_agents(self) -> dict[str, Any]:
         """The agent that it was learned with, or the mixture of agents, by their keys.

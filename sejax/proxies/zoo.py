@@ -225,9 +225,9 @@ def push(
     Raises:
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
-    require(hub.is_repo(repo), "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
-    stored = header.read(source, single=True)
-    config, address = stored.header.config, f"{hub.SCHEME}{repo}"
+    stored, address = header.read(source, single=True), f"{hub.SCHEME}{repo}"
+    is_repo, config = hub.parse(address, "repo")[0] == repo, stored.header.config
+    require(is_repo, "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
     with hub.explained("repo", repo):

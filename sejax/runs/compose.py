@@ -108,7 +108,7 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
       {'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}
     """
     texts: Tree = {name: unquoted(text) for name, text in words(overrides).items()}
-    if not texts.get("preset", "").endswith(".yaml"):
+    if not texts.get("preset", "").endswith((".yaml", ".yml")):
         return _tree(texts, groups)
     path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
     try:

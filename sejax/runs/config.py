@@ -29,7 +29,6 @@ from sejax.options import (
     field_lines,
     registry,
     require,
-    require_known,
     shortened,
 )
 from sejax.options.plain import (
@@ -219,8 +218,9 @@ class LearnConfig(CommandConfig):
         is_alone, given = len(self.agents) == 1, self.mixture.weights
         is_idle = is_alone and self.mixture != MixtureConfig()
         require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
-        for key in given:
-            require_known("mixture.weights", key, self.agents)
+        for key in given.keys() - self.agents.keys():
+            known = [f"mixture.weights.{x}" for x in self.agents]
+            raise unknown_field(f"mixture.weights.{shortened(key)}", known)
         weights = {} if is_alone else {key: given.get(key, 1.0) for key in self.agents}
         are_some = is_alone or any(weights.values())
         require(are_some, "mixture.weights", "must have one above 0. Leave one of them out.")

@@ -6,8 +6,10 @@ process, even if that is killed. The next worker goes on with a running trial wh
 
 import contextlib
 import dataclasses
+import functools
 import math
 import shlex
+import sqlite3
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -30,7 +32,7 @@ from sejax.runs.run_directory import RunDirectory
 from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
 
-WAIT = {"connect_args": {"timeout": 3600}}  # s, for another worker's write to the database
+WAIT = 3600  # s, for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # errors of a database
 SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # columns of a trial
 
@@ -48,11 +50,14 @@ def open_study(search: StudyPlan) -> optuna.Study:
     (folder / "trials").mkdir(parents=True, exist_ok=True)
     store = Store(folder, search.settings(), field="search_dir", free=FREE)
     budgets = search.config.min_generations, search.config.max_generations
+    # An address would end at a question mark in the folder's name.
+    file = folder / "study.db"
+    connect = functools.partial(sqlite3.connect, file, WAIT, check_same_thread=False)
     with _lock(search, "study"):
         is_new = store.get("search") is None
         study = optuna.create_study(
             study_name=search.study,
-            storage=optuna.storages.RDBStorage(f"sqlite:///{folder / 'study.db'}", WAIT),
+            storage=optuna.storages.RDBStorage("sqlite:///study.db", {"creator": connect}),
             pruner=optuna.pruners.HyperbandPruner(*budgets, REDUCTION_FACTOR),
             direction="maximize",
             load_if_exists=True,
