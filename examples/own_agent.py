@@ -10,8 +10,8 @@ The script trains eight agents on Pendulum for 20,000 steps, 20 seconds on four 
 
 An agent is a `sejax.Agent`, a bundle of pure functions of one agent's state; the inner loop stores
 its steps and calls `update` on batches of them. The dataclass makes it configurable: its fields are
-options of the command line, and those that are `traced` are numbers that a compiled program takes
-as arguments, so that one program serves every learning rate.
+options of the command line. Those that are `traced` are numbers that a compiled program can take as
+arguments, so that the agents of a population may differ in them.
 
 Source: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), algorithm 1.
 """

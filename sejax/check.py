@@ -20,6 +20,7 @@ import functools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -162,11 +163,14 @@ def run(config: CheckConfig) -> dict[str, Any]:
 
 
 def _tuned(task: Task) -> AgentConfig:
-    """An agent with the settings of `preset=best`, but one warm-up episode: SEs alone need more."""
+    """An agent with the settings of `preset=best`, but one warm-up episode: SEs alone need more.
+
+    Tabular agents have none, as by default.
+    """
     name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
     beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
-    fields = beside.get("agent", {}) | {"name": name, "warmup_episodes": 1}
-    return configure("agent", fields)
+    warmup = {"warmup_episodes": int(task.num_states is None)}
+    return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)
 
 
 def _null(
@@ -241,7 +245,7 @@ def _reported(
     cost: dict[str, Any] = {name: run[name] for name in ("real_steps", "cpu_s") if name in run}
     if cost:  # "never" if agents trained on the proxy do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
-        cost["agents_to_break_even"] = round(cost["real_steps"] / saved) if saved > 0 else "never"
+        cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())
     found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"

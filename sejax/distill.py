@@ -219,7 +219,7 @@ def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
             "world": "proxy",
             "num_agents": len(students),
             "return_mean": float(counted(students["test_return"]).mean()),
-            "return_std": float(counted(students["test_return"]).std(ddof=0)),
+            "return_std": float(counted(students["test_return"]).std(ddof=len(students) > 1)),
             "train_steps": float(students["train_steps"].mean()),
         }
         for agent, students in rows.groupby("agent", sort=False)

@@ -131,10 +131,11 @@ class EvaluateConfig(CommandConfig):
         default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)
         names = names or {default: default}
         known = learned.get("agents", {}) if hparams is None else {}
-        by_name = {agent["name"]: agent for agent in [*known.values()][::-1]}
-        of_names = {key: by_name.get(name, {"name": name}) for key, name in names.items()}
-        same = {key: agent for key, agent in known.items() if agent["name"] == names.get(key)}
-        return {"proxy": {"agents": of_names | same}}
+        chosen = Tree()
+        for key, name in names.items():
+            same = {k: agent for k, agent in known.items() if agent["name"] == name}
+            chosen[key] = same.get(key) or next(iter(same.values()), {"name": name})
+        return {"proxy": {"agents": chosen}}
 
 
 def agents_in(config: Mapping[str, Any], imports: Collection[str], is_learned: bool) -> Tree:

@@ -117,9 +117,11 @@ class GenerationEvaluator:
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
-            of_population = jnp.concatenate(keys.population[numbers])  # old keys have an axis more
+            keys_population = keys.population[numbers]
+            # Those of jax.random.PRNGKey have an axis more.
+            keys_population = keys_population.reshape(-1, *keys_population.shape[2:])
             trainings = Trainings(
-                key=jnp.concatenate([of_population, keys.incumbent[:, agent_index]]),
+                key=jnp.concatenate([keys_population, keys.incumbent[:, agent_index]]),
                 candidate=jnp.concatenate([population, incumbent]),
                 active=active,
                 test_params=test_params,

@@ -77,22 +77,23 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(
-        self, outcome: Outcome, score: Callable[[Outcome], Array] | None = None
-    ) -> Float[Array, "*agent"]:
-        """Scores, of `score` unless another function is given; nan for trainings that diverged.
+    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """The scores that compare candidates; nan for trainings that diverged.
 
         Raises:
           ConfigError: unless there is a score for each agent.
         """
-        scores, shape = jnp.asarray((score or self.score)(outcome)), outcome.nonfinite.shape
-        must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
-        require(scores.shape == shape, "objective", must)
-        return jnp.where(outcome.nonfinite, jnp.nan, scores)
+        return self._of_each(outcome, self.score)
 
     def shown_score(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
-        return self(outcome, self.shown)
+        return self._of_each(outcome, self.shown or self.score)
+
+    def _of_each(self, outcome: Outcome, score: Callable[[Outcome], Array]) -> Array:
+        scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
+        must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
+        require(scores.shape == shape, "objective", must)
+        return jnp.where(outcome.nonfinite, jnp.nan, scores)
 
 
 @dataclass(frozen=True, kw_only=True)

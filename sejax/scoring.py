@@ -18,7 +18,6 @@ from sejax.agents.mixture import Mixture
 from sejax.es.base import Evaluations, PerGroup, Strategy
 from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
-from sejax.options import require
 
 
 @struct.dataclass
@@ -104,13 +103,8 @@ class Scoring:
         """The scoring of a strategy's population.
 
         Raises:
-          ConfigError: if the population is too small for the mixture, or if the strategy compares
-            scores across generations and their units differ.
+          ConfigError: if the population is too small for the mixture.
         """
-        has_one_unit = mixture.size == 1 and objective.shown is None
-        must = "must compare scores within a generation with several agents or a curriculum"
-        message = f"{must}; got one that remembers scores. Set es=nes."
-        require(has_one_unit or not strategy.remembers_scores, "es", message)
         # Rounded up to equally many with each agent.
         num_evals = -(-strategy.evaluations.num_incumbent_evals // mixture.size) * mixture.size
         return cls(

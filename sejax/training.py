@@ -5,10 +5,10 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -115,7 +115,7 @@ class TrainResult:
         same form; None if there are no such tests.
       episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
         after the last.
-      nonfinite: whether a number that is not finite was met: an output of the world or a weight.
+      nonfinite: whether a number that is not finite was met: an output of a proxy, or a weight.
       eval_steps: real steps spent on tests between training episodes, `[]` int32.
       stored: arrays of the agent's buffer at the end, if the trainer keeps them; else None.
     """
@@ -129,6 +129,17 @@ class TrainResult:
     nonfinite: Array
     eval_steps: Array
     stored: PyTree = None
+
+
+class _StepKeys(NamedTuple):
+    """The keys of one step, named by what each is for."""
+
+    act: Array
+    env: Array
+    sample: Array
+    update: Array
+    reset: Array
+    test: Array
 
 
 @struct.dataclass
@@ -284,14 +295,12 @@ class _Loop:
             stored=stored if self.keeps_stored else None,
         )
 
-    def begin(
-        self, key: Array, env_params: PyTree, hparams: Hparams, active: Array | bool
-    ) -> _LoopState:
+    def begin(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
         return _LoopState(
-            active=jnp.asarray(active),
+            active=active,
             step=jnp.int32(0),
             train_steps=jnp.int32(0),
             episode=jnp.int32(0),
@@ -331,7 +340,7 @@ class _Loop:
         last = dataclasses.replace(state, step=state.step - 1)
         agent_state = jax.lax.cond(
             (state.step == num_steps + length) & (state.episode >= self.agent.spec.learns_from),
-            partial(self.learn, stored, None, last, step_keys(key, last.step, 6)),
+            partial(self.learn, stored, None, last, _StepKeys(*step_keys(key, last.step, 6))),
             lambda agent_state: agent_state,
             state.agent_state,
         )
@@ -342,26 +351,24 @@ class _Loop:
         arrays: PyTree,
         transition: Transition | None,
         state: _LoopState,
-        keys: Sequence[Array],
+        keys: _StepKeys,
         agent_state: AgentState,
     ) -> AgentState:
         """One update, after the step that made `transition`."""
-        _, _, key_sample, key_update, *_ = keys
         size = self.agent.batch_size(agent_state)
         buffer = self.buffer(state)
-        batch = buffer.batch(key_sample, arrays, state.step + 1, transition, size)
-        return self.agent.update(key_update, agent_state, batch)
+        batch = buffer.batch(keys.sample, arrays, state.step + 1, transition, size)
+        return self.agent.update(keys.update, agent_state, batch)
 
     def step(
         self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool, learns: bool = True
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (stored, curve), (key, env_params) = large, consts
-        keys = step_keys(key, state.step, 6)
-        key_act, key_env, _, _, *keys_end = keys
-        action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
+        keys = _StepKeys(*step_keys(key, state.step, 6))
+        action = self.agent.act(keys.act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
-            key_env, state.env_state, self.agent.env_action(action), env_params
+            keys.env, state.env_state, self.agent.env_action(action), env_params
         )
         truncated = self.env.is_truncated(env_state, env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)
@@ -395,7 +402,7 @@ class _Loop:
         )
         before = state
         state = jax.lax.cond(
-            ended, lambda s: self.end_episode(keys_end, s, env_params, finished), lambda s: s, state
+            ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
         )
         rows = {
             "returns": before.episode_return,
@@ -408,24 +415,23 @@ class _Loop:
         return (stored, curve), state
 
     def end_episode(
-        self, keys: list[Array], state: _LoopState, env_params: PyTree, finished: Array
+        self, keys: _StepKeys, state: _LoopState, env_params: PyTree, finished: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
         Under `vmap` this runs for all agents if it runs for one. Only agents that have `finished`
         are tested.
         """
-        key_reset, key_test = keys
         judged = state.episode_return
         if self.test_fn is not None:
-            tested, num_steps = self.test_fn(key_test, state.agent_state, finished)
+            tested, num_steps = self.test_fn(keys.test, state.agent_state, finished)
             state = dataclasses.replace(
                 state, tested=tested, eval_steps=state.eval_steps + num_steps
             )
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])
         stop = self.stops(state, recent)
-        obs, env_state = self.env.reset_env(key_reset, env_params)
+        obs, env_state = self.env.reset_env(keys.reset, env_params)
         num_episodes = state.episode + 1
         return dataclasses.replace(
             state,

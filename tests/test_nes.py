@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from support import refused
 
-import sejax
-from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, from_evosax
 from sejax.es.nes import NESConfig
@@ -230,17 +228,7 @@ def another_of_evosax(num_dims):
         population_size=16, solution=jnp.zeros(num_dims), std_schedule=lambda generation: 0.1
     )
     evaluations = Evaluations(num_incumbent_evals=2)
-    return from_evosax(algorithm, remembers_scores=True, evaluations=evaluations)
-
-
-def test_a_strategy_that_remembers_scores_wants_them_in_one_unit():
-    config = sejax.config(["env=gridworld_2x2"])
-    parts = config.parts()
-    es = another_of_evosax(make_bilevel(**parts).init(jax.random.key(0)).best.size)
-    assert sejax.make_learner(**{**parts, "es": es})
-    for more in (["agents=[q_learning,sarsa]"], ["objective.first_eval_steps=2"]):
-        parts = sejax.config(["env=gridworld_2x2", *more]).parts()
-        assert refused(sejax.make_learner, **{**parts, "es": es}) == "es"
+    return from_evosax(algorithm, evaluations=evaluations)
 
 
 TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)

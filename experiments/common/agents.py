@@ -231,9 +231,13 @@ def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
 
     A mean would leave them out, and so be better for each of them.
     """
-    if "test_return" not in rows or not (lost := rows["test_return"].isna()).any():
+    if "test_return" not in rows:
+        return rows
+    lost = rows["test_return"].isna() | (rows.get("nonfinite", 0) > 0)
+    if not lost.any():
         return rows
     returns = ["test_return", *return_columns(rows)]
+    rows = rows.assign(**{column: rows[column].mask(lost) for column in returns})
     worst = float(rows[returns].min(axis=None))
     count = len(rows[lost].groupby(["group", "agent"]))
     print(f"{name}: {count} agents diverged; their tests count as {worst:.1f}, the worst return.")

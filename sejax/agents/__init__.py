@@ -106,9 +106,10 @@ def require_fit(
     """
     if not _fits(agent, spec):
         known, got = fitting(spec), shortened(registry.name_of("agent", agent))
-        must = f"{field} must be one of {', '.join(known)} in {task_name} with {spec.states} states"
-        message = f"{must} and {spec.actions} actions; got {got}. Set agent={known[0]}."
-        raise ConfigError(message, field)
+        must = f"{field} must be one of {', '.join(known) or 'your own'} in {task_name} with"
+        must += f" {spec.states} states and {spec.actions} actions; got {got}"
+        fix = f"Set agent={known[0]}" if known and field == "agent" else "Leave it out"
+        raise ConfigError(f"{must}. {fix}.", field)
     if exploration.states is not None and agent.states not in (None, exploration.states):
         agent_name = shortened(registry.name_of("agent", agent))
         exploration_name = shortened(registry.name_of("exploration", exploration))

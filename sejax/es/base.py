@@ -83,8 +83,9 @@ class Evaluations:
     ) -> tuple[Float[Array, " turn"], Float[Array, ""]]:
         """The incumbent's scores, with agents that diverged ranked last, and their mean.
 
-        Agents that diverged get the lowest finite score of the generation: a mean without them
-        would rank an incumbent by its other agents alone. If all diverged, the mean is nan.
+        Agents that diverged get the lowest finite score of their algorithm in the generation: a
+        mean without them would rank an incumbent by its other agents alone. If all diverged, the
+        mean is nan.
         """
         all_scores = jnp.concatenate([population, scores])
         lowest = jnp.nanmin(jnp.where(jnp.isfinite(all_scores), all_scores, jnp.nan))
@@ -105,8 +106,6 @@ class Strategy:
       incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
       population_size: vectors that `ask` returns.
       antithetic: whether the second half of the population mirrors the first at the incumbent.
-      remembers_scores: whether it compares scores across generations, which then must have one
-        unit.
       evaluations: how often each candidate is evaluated.
     """
 
@@ -116,7 +115,6 @@ class Strategy:
     incumbent: Callable[[StrategyState], Float[Array, " dims"]]
     population_size: int
     antithetic: bool = False
-    remembers_scores: bool = False
     evaluations: Evaluations = Evaluations()
 
 
@@ -125,7 +123,7 @@ class StrategyOptions(Options):
     """What the configurations of sejax's strategies share.
 
     Attributes:
-      population_size: n_p: perturbations in a generation
+      population_size: n_p: perturbations in a generation; of evosax's, candidates
       num_evals: agents on each candidate
       eval_aggregate: how the scores of a candidate's agents become one
       common_random_numbers: the same inner seeds for all candidates of a generation

@@ -100,7 +100,6 @@ def from_evosax(
     params: "Params | None" = None,
     *,
     antithetic: bool = False,
-    remembers_scores: bool = False,
     evaluations: Evaluations = Evaluations(),
 ) -> Strategy:
     """A strategy from an algorithm of evosax. The algorithm's mean is the incumbent.
@@ -109,7 +108,6 @@ def from_evosax(
       algorithm: a distribution-based algorithm for vectors `[num_dims]`.
       params: of the algorithm; its `default_params` if not given.
       antithetic: whether the second half of its candidates mirrors the first at the mean.
-      remembers_scores: whether it compares scores across generations.
       evaluations: how often each candidate is evaluated.
 
     Example:
@@ -130,8 +128,7 @@ def from_evosax(
         finite, fitness = jnp.isfinite(scores), -scores
         worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
         best = jnp.min(jnp.where(finite, fitness, jnp.inf))
-        of_none = jnp.inf if remembers_scores else 0.0
-        others = jnp.where(finite.any(), worst + jnp.maximum(worst - best, 1.0), of_none)
+        others = jnp.where(finite.any(), worst + jnp.maximum(worst - best, 1.0), 0.0)
         fitness = jnp.where(finite, fitness, others)
         return algorithm.tell(key, population, fitness, state, params)[0]
 
@@ -142,6 +139,5 @@ def from_evosax(
         incumbent=algorithm.get_mean,
         population_size=algorithm.population_size,
         antithetic=antithetic,
-        remembers_scores=remembers_scores,
         evaluations=evaluations,
     )

@@ -1,7 +1,7 @@
 r"""Score transforms: from the candidates' scores K_i to their weights F_i; eight, or your own.
 
-Scores are maximised. A score that is not finite ranks below every finite one and gets the weight of
-the worst. Some transforms need a difference between candidates, or between a candidate and the
+Scores are maximised. A score that is not finite ranks below every finite one, or counts as the
+worst of them. Some transforms need a difference between candidates, or between a candidate and the
 incumbent. Without a difference their weights are all 0 and the proxy stays.
 
 Source: paper, appendix "NES Score Transformation". `K_psi` is the incumbent's mean score.
@@ -92,9 +92,8 @@ def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _safe_divide(advantage, advantage.sum())
 
 
-_BY_RANK = (linear, rank, nes, nes_unnormalized)
-_BY_ADVANTAGE = (single_best, single_better, all_better_1, all_better_2)
-TRANSFORMS: dict[str, ScoreTransform] = {x.__name__: x for x in (*_BY_RANK, *_BY_ADVANTAGE)}
+_ALL = (linear, rank, nes, nes_unnormalized, single_best, single_better, all_better_1, all_better_2)
+TRANSFORMS: dict[str, ScoreTransform] = {transform.__name__: transform for transform in _ALL}
 
 
 def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:

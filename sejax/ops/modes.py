@@ -19,6 +19,6 @@ def require_modes() -> None:
     Raises:
       ConfigError: for the mode, such as `jax_enable_x64`.
     """
-    for mode, reason in MODES.items():
-        message = f"must be false: {reason}; got true. Set {mode.upper()}=false."
-        require(not getattr(jax.config, mode), mode, message)
+    for mode, why in MODES.items():
+        fix = f"Set {mode.upper()}=false."
+        require(not getattr(jax.config, mode), mode, f"must be false: {why}. {fix}")

@@ -1,4 +1,4 @@
-"""What a proxy's file holds, read without JAX: tensors, and a header of plain values.
+"""What a proxy's file holds: tensors of NumPy, and a header of plain values.
 
 A file is in the safetensors format, with a checksum. It holds one proxy, or a set of proxies that
 share a configuration. The tensors of a set have a leading axis over its proxies. Reading a file

@@ -252,7 +252,7 @@ class SyntheticEnv(ProxyEnv):
             if self.config.initial_state == "learned":
                 vector = noise + self._apply(params.weights, "start", noise)
             vector = vector if self._units is None else self._units.decode(vector)
-            # Clipped to the limit, not beyond: the first step from there ends the episode.
+            # Clipped to the limit, not beyond: a one-step SE, whose state stays, ends there.
             vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.observe(state), state

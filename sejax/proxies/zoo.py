@@ -1,6 +1,6 @@
 """The proxies that ship with the package, model cards, and sharing on the Hugging Face Hub.
 
-This module reads headers of files without JAX. `tools/ship_proxy.py` writes the shipped files, and
+This module reads the headers of files. `tools/ship_proxy.py` writes the shipped files, and
 `tools/make_zoo.py` makes `docs/zoo.md` of them.
 """
 

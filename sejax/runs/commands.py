@@ -93,7 +93,7 @@ def messages() -> Iterator[None]:
         fail(str(error), FAILED)
     except OSError as error:
         message = f"A file could not be written or read: {error}. Files written before are whole"
-        fail(f"{message}; run the same command again to resume from there.", FAILED)
+        fail(f"{message}; run the same command again.", FAILED)
     except Exception as error:
         if message := runtime.platform_error():
             fail(message, BAD_INPUT)

@@ -115,6 +115,8 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
         values = flatten(header.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         return merge(_beside(file, typed, groups), typed)
+    except ConfigError:  # it is readable
+        raise
     except UNREADABLE as error:
         got = f"got {shortened(path, 40)} ({told(error)})"
         must = f"preset must be a name, or a YAML file of fields; {got}. Set preset=best."

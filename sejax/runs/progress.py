@@ -29,8 +29,8 @@ class RunProgress:
             self.say(f"{none}: these are general ones, not tuned (docs/defaults.md).")
 
     def status(self, text: str) -> None:
-        """Prints a step of the work before the first generation."""
-        self._started = time.monotonic()
+        """Prints a step of the work before a generation; steps per second count from it on."""
+        self._started, self._steps = time.monotonic(), 0
         self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
@@ -39,7 +39,7 @@ class RunProgress:
             print(text, flush=True)
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        """Prints the numbers of a generation; steps per second are the mean of this session."""
+        """Prints the numbers of a generation; steps per second are a mean."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values, agents = info.values, list(self._config.agents)

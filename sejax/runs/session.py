@@ -128,7 +128,7 @@ def _advance(
     if length not in chunks.compiled:
         report.status("compiling")
         chunks.compile(length)
-        report.status("first generation")
+        report.status("computing")
     state, info = chunks.advance(state, length)
     pending: Any = state.generation
     while not pending.is_ready():  # only Python code hears Ctrl-C
