@@ -243,11 +243,10 @@ def make_evaluator(
     """
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_part("training", TrainingConfig, training)
-    budget = max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
-    must = f"must end a test episode within 1,000 times the training budget of {training.max_steps}"
-    got = f"because an agent may never end it; got {task.max_steps:,} for {task.name}"
-    message = f"{must} steps, {got}. Set env.max_steps=N, or Task(max_steps=N)."
-    require(task.max_steps <= 1000 * budget, "env.max_steps", message)
+    most = 1000 * max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
+    must = f"must be at most {most:,}, as an agent may never end a test; got {task.max_steps:,}"
+    message = f"{must} for {task.name}. Set env.max_steps=N, or Task(max_steps=N)."
+    require(task.max_steps <= most, "env.max_steps", message)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)

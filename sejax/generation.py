@@ -117,9 +117,7 @@ class GenerationEvaluator:
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
-            keys_population = keys.population[numbers]
-            # Those of jax.random.PRNGKey have an axis more.
-            keys_population = keys_population.reshape(-1, *keys_population.shape[2:])
+            keys_population = jax.lax.collapse(keys.population[numbers], 0, 2)
             trainings = Trainings(
                 key=jnp.concatenate([keys_population, keys.incumbent[:, agent_index]]),
                 candidate=jnp.concatenate([population, incumbent]),

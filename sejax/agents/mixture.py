@@ -6,7 +6,6 @@ helps all agents, with the same number of trainings.
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -113,7 +112,7 @@ class Mixture:
             behind = shares * (candidate + 1) - [len(hand) for hand in hands]
             hands[int(np.argmax(behind))].append(candidate)
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
-        field, size = "es.population_size", 2 * math.ceil(1 / shares[shares > 0].min() + self.size)
+        field, size = "es.population_size", 2 * int(1 / shares[shares > 0].min() + self.size + 1)
         got = f"got {num_dealt} perturbations for weights {shortened(self.weights)}"
         require(are_enough, field, f"must leave each agent one; {got}. Set {field}={size}.")
         mirrored = (0, num_dealt) if antithetic else (0,)

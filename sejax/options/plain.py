@@ -23,6 +23,7 @@ from sejax.options import (
     listed,
     marks,
     nearest,
+    old,
     registry,
     require,
     shortened,
@@ -31,10 +32,6 @@ from sejax.options import (
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
-# Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
-GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
-GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
-GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
 # Our names of fields, by the names that others use.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
@@ -123,7 +120,7 @@ def from_plain(
     hints, defaults, fields = hints_of(cls, where), fields_of(cls), {}
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
-        if name not in defaults and GONE.get(name, MISSING) == value:
+        if name not in defaults and old.GONE.get(name, MISSING) == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
@@ -154,7 +151,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f" Did you mean {ranked[0]}?" if ranked else ""
-    is_no = "is no field any more" if last in GONE else "is no field"
+    is_no = "is no field any more" if last in old.GONE else "is no field"
     return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
 
 

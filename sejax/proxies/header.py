@@ -17,7 +17,7 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
-from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
+from sejax.options import LARGEST, ConfigError, old, registry, require, shortened, unknown_name
 from sejax.options.plain import configure, expanded, from_plain
 from sejax.proxies import hub
 
@@ -28,8 +28,6 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
 KIND = "sejax"  # name of the metadata's entry
-# Fields that older files lack, with the defaults of that time.
-OLD_TRAINING = {"time_limit_is_terminal": True}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +38,7 @@ class Header:
       format_version: version of the format; this module reads only one.
       task: name of the real task.
       interface: the task's spaces and step limit, see `sejax.Task.interface`.
-      config: configuration that the proxies were learned with, `upgraded`; at least `env` and
+      config: configuration that the proxies were learned with, in today's form; at least `env` and
         `proxy`.
       discount: gamma of the agent that they were learned with, in [0, 1].
       is_set: whether the tensors have a leading axis over several proxies.
@@ -59,9 +57,7 @@ class Header:
     proxies: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        config = upgraded(self.config)
-        if isinstance(training := config.get("training"), Mapping):
-            config["training"] = {**OLD_TRAINING, **training}
+        config = old.file_of_today(self.config)
         object.__setattr__(self, "config", config)
         agents = dict(config["agents"]).values()
         parts = [config["env"], config["proxy"], *agents, *self.proxies]
@@ -113,26 +109,6 @@ def _sizes_of(space: Space) -> list[int]:
         return [space.n]
     are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
     return [space.size * are_bounds]
-
-
-def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration of a file, in the form in which files are written today.
-
-    Older versions wrote an only agent as `agent`, and the settings of a mixture among its agents.
-    """
-    none = [name for name in ("agent", "agents") if config.get(name) is None]
-    new = {name: x for name, x in config.items() if name not in none}
-    if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
-        new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
-    if isinstance(agents := new.setdefault("agents", {}), Mapping) and "mixture" not in new:
-        of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
-        by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
-        of_several = by_key if len(by_key) > 1 else {}
-        weights = {key: x.pop("weight") for key, x in of_several.items() if "weight" in x}
-        if of_all or weights:
-            new["mixture"] = of_all | {"weights": weights}
-        new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
-    return new
 
 
 def is_registered(group: str, stored: object) -> bool:

@@ -24,10 +24,9 @@ from typing import Any, TypeVar
 import yaml
 
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Options, listed, nearest, registry, require, shortened, told
+from sejax.options import ConfigError, Options, listed, nearest, old, registry, require, shortened
 from sejax.options.plain import expanded, fields_of, flatten, merge, split, unquoted
 from sejax.options.registry import key_of
-from sejax.proxies import header
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
 # A choice may stand beside its fields, as in config.yaml.
@@ -112,13 +111,13 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
         return _tree(texts, groups)
     path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
     try:
-        values = flatten(header.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
+        values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         return merge(_beside(file, typed, groups), typed)
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
-        got = f"got {shortened(path, 40)} ({told(error)})"
+        got = f"got {shortened(path, 40)} ({shortened(error, 120)})"
         must = f"preset must be a name, or a YAML file of fields; {got}. Set preset=best."
         raise ConfigError(must, "preset") from error
 
@@ -165,7 +164,7 @@ def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
         for part in reversed(path):
             value = {part: value}
         tree = merge(tree, value)
-    return header.upgraded(tree)
+    return old.of_today(tree)
 
 
 def names_of(agents: Mapping[str, Any]) -> dict[str, str]:

@@ -27,6 +27,7 @@ from sejax.options import (
     WholeNumber,
     errors_of,
     field_lines,
+    old,
     registry,
     require,
     shortened,
@@ -41,7 +42,7 @@ from sejax.options.plain import (
     to_plain,
     unknown_field,
 )
-from sejax.proxies import ProxyConfig, header
+from sejax.proxies import ProxyConfig
 from sejax.runs import compose
 from sejax.runs.compose import Tree
 from sejax.training import TrainingConfig, require_reachable
@@ -373,8 +374,7 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    tree = merge({"training": header.OLD_TRAINING}, header.upgraded(values))
-    return LearnConfig.of_tree(tree, imports)
+    return LearnConfig.of_tree(old.file_of_today(values), imports)
 
 
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:

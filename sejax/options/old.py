@@ -1,0 +1,39 @@
+"""What files and command lines of earlier versions say, in today's words."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sejax.options import registry
+
+# Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
+GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
+GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
+GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
+# Fields of a training that older files lack, with the defaults of that time.
+TRAINING = {"time_limit_is_terminal": True}
+
+
+def of_today(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration in the form in which files are written today.
+
+    Older versions wrote an only agent as `agent`, and the settings of a mixture among its agents.
+    """
+    new = {k: x for k, x in config.items() if x is not None or k not in ("agent", "agents")}
+    if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
+        new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
+    if isinstance(agents := new.setdefault("agents", {}), Mapping) and "mixture" not in new:
+        of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
+        by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
+        are_several = len(by_key) > 1
+        weights = {k: x.pop("weight") for k, x in by_key.items() if are_several and "weight" in x}
+        if of_all or weights:
+            new["mixture"] = of_all | {"weights": weights}
+        new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
+    return new
+
+
+def file_of_today(config: Mapping[str, Any]) -> dict[str, Any]:
+    """As `of_today`, with the fields of the training that a file lacks."""
+    training = config.get("training")
+    full = {"training": {**TRAINING, **training}} if isinstance(training, Mapping) else {}
+    return of_today(config) | full
