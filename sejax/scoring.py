@@ -114,10 +114,19 @@ class Scoring:
             evaluations=dataclasses.replace(strategy.evaluations, num_incumbent_evals=num_evals),
         )
 
+    @property
+    def agent_of(self) -> PerGroup[np.ndarray]:
+        """The number of each training's agent: in the population, and on the incumbent."""
+        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates), int)
+        for agent_index, numbers in enumerate(self.candidates):
+            of_candidate[numbers] = agent_index
+        turns = np.arange(self.evaluations.num_incumbent_evals)
+        of_population = np.repeat(of_candidate, self.evaluations.num_evals)
+        return PerGroup(of_population, turns % self.mixture.size)
+
     def trainings_of(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all trainings of a generation."""
-        of_population, of_incumbent = self._numbers(agent_index)
-        return np.concatenate([of_population, self._num_population + of_incumbent])
+        return np.flatnonzero(np.concatenate(self.agent_of) == agent_index)
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
@@ -163,14 +172,12 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        population, incumbent = jnp.split(scores, [self._num_population])
-        means = []
+        agent_of, means = self.agent_of, []
+        population, incumbent = jnp.split(scores, [agent_of.population.size])
         for agent_index in range(self.mixture.size):
-            of_population, of_incumbent = self._numbers(agent_index)
-            repaired, mean = self.evaluations.incumbent_scores(
-                incumbent[of_incumbent], population[of_population]
-            )
-            incumbent = incumbent.at[of_incumbent].set(repaired)
+            tried, turns = (np.flatnonzero(group == agent_index) for group in agent_of)
+            repaired, mean = self.evaluations.incumbent_scores(incumbent[turns], population[tried])
+            incumbent = incumbent.at[turns].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
@@ -181,18 +188,6 @@ class Scoring:
             incumbent_mean=aggregate(agent_means),
             diverged=~jnp.isfinite(scores),
         )
-
-    @property
-    def _num_population(self) -> int:
-        """Trainings on the population."""
-        return sum(numbers.size for numbers in self.candidates) * self.evaluations.num_evals
-
-    def _numbers(self, agent_index: int) -> PerGroup[np.ndarray]:
-        """The numbers of an agent's trainings within each group."""
-        num_evals, num_agents = self.evaluations.num_evals, self.mixture.size
-        of_population = np.add.outer(self.candidates[agent_index] * num_evals, np.arange(num_evals))
-        of_incumbent = np.arange(agent_index, self.evaluations.num_incumbent_evals, num_agents)
-        return PerGroup(of_population.ravel(), of_incumbent)
 
     def _by_agent(
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]

@@ -112,11 +112,14 @@ def require_own_steps(env: Environment) -> None:
     `step_env`, so it would silently leave the wrapper out.
 
     Raises:
-      ConfigError: for a class without `step_env` or `reset_env`.
+      ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`, and for
+        what has no `step_env`, such as a task.
     """
     must = f"must have reset_env and step_env, as gymnax's have; got {type(env).__name__}"
     fix = "Derive a wrapper from sejax.envs.wrappers.Wrapper; of a task pass task.env"
-    is_whole = {"reset_env", "step_env"} <= {*dir(type(env))}
+    methods = dir(type(env))
+    is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
+    is_whole &= hasattr(env, "step_env")
     options.require(is_whole, "env", f"{must}. {fix}.")
 
 
