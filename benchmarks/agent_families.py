@@ -2,7 +2,7 @@
 
 Each family trains `--agents` agents for `--steps` steps on a fresh SE of the paper's kind, soft and
 with the task's step limit. Hyperparameters are the paper's: for DDQN those of CartPole, with the SE
-of its table, for PPO `PPOConfig.paper()`, for the others the defaults.
+of its table, for PPO `preset=paper` of MountainCarContinuous' RNs, for the others the defaults.
 DDQN, which PyTorch trains too, and PPO are measured at those of `preset=best` as well, where
 networks and batches are small. Agents learn from the first step on; training never stops early, and
 a fresh SE hardly ever ends an episode. PPO learns when its rollout is full: it trains for a
@@ -63,7 +63,8 @@ class Family:
             if self.settings == "paper":
                 proxy = chosen.proxy
         elif self.agent == "ppo":
-            agent = sejax.PPOConfig.paper()
+            words = "env=mountain_car_continuous", "proxy=rn", "agent=ppo", "preset=paper"
+            agent = replace(sejax.config(words).agent, action_repeat=1)
         else:
             agent = configure("agent", {"name": self.agent, **PAPERS.get(self.agent, {})})
         agent = replace(agent, warmup_episodes=0)

@@ -212,14 +212,15 @@ def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """The results of fresh students of each agent, in the form that the SE's file keeps."""
+    rows = rows.assign(test_return=counted(rows["test_return"]))
     return [
         {
             "agent": agent,
             "hparams": "as_learned",
             "world": "proxy",
             "num_agents": len(students),
-            "return_mean": float(counted(students["test_return"]).mean()),
-            "return_std": float(counted(students["test_return"]).std(ddof=len(students) > 1)),
+            "return_mean": float(students["test_return"].mean()),
+            "return_std": float(students["test_return"].std(ddof=len(students) > 1)),
             "train_steps": float(students["train_steps"].mean()),
         }
         for agent, students in rows.groupby("agent", sort=False)

@@ -39,7 +39,7 @@ class Trainings:
     """The trainings of one agent in a generation, leaves `[training, ...]`."""
 
     key: Array
-    candidate: Float[Array, "training dims"]
+    weights: Float[Array, "training dims"]  # of the proxy, flat
     active: Array
     test_params: PyTree
 
@@ -89,7 +89,7 @@ class GenerationEvaluator:
             evaluate = make_evaluator(agent, *worlds, in_batches=False)
 
             def run(one: Trainings) -> Outcome:
-                params = proxy.params(unravel(one.candidate))
+                params = proxy.params(unravel(one.weights))
                 return evaluate(one.key, params, one.active, one.test_params)
 
             return run
@@ -110,7 +110,7 @@ class GenerationEvaluator:
         keys, shared = candidates.keys, (candidates.active, candidates.test_params)
         by_agent = []
         num_evals = self._scoring.evaluations.num_evals
-        pairs = zip(self._scoring.candidates, self.num_trainings, strict=True)
+        pairs = zip(self._scoring.candidates_of, self.num_trainings, strict=True)
         for agent_index, (numbers, size) in enumerate(pairs):
             population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
             incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
@@ -120,7 +120,7 @@ class GenerationEvaluator:
             keys_population = jax.lax.collapse(keys.population[numbers], 0, 2)
             trainings = Trainings(
                 key=jnp.concatenate([keys_population, keys.incumbent[:, agent_index]]),
-                candidate=jnp.concatenate([population, incumbent]),
+                weights=jnp.concatenate([population, incumbent]),
                 active=active,
                 test_params=test_params,
             )

@@ -15,6 +15,7 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 
+from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
 from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
@@ -71,6 +72,10 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
       FailedError: after the last run, if no search mean of some run had a finite score.
       OSError: if a file cannot be written; everything saved before is whole.
     """
+    # The last run of a sweep must not be refused after the others have run.
+    programs = {str(x.plain() | {"seed": 0, "run_dir": None}): x for x in configs}
+    for config in programs.values() if len(programs) > 1 else ():
+        make_bilevel(**config.parts())
     scores, diverged = [], []
     with contextlib.ExitStack() as exit_stack:
         compiled = None

@@ -88,14 +88,14 @@ class Scoring:
     Attributes:
       objective: the score of one outcome.
       mixture: the agents.
-      candidates: for each agent, the numbers of the candidates that it trains on.
+      candidates_of: for each agent, the numbers of the candidates that it trains on.
       evaluations: how often each candidate is evaluated; each agent evaluates the incumbent equally
         often.
     """
 
     objective: Objective
     mixture: Mixture
-    candidates: tuple[np.ndarray, ...]
+    candidates_of: tuple[np.ndarray, ...]
     evaluations: Evaluations
 
     @classmethod
@@ -110,19 +110,19 @@ class Scoring:
         return cls(
             objective=objective,
             mixture=mixture,
-            candidates=mixture.deal(strategy.population_size, strategy.antithetic),
+            candidates_of=mixture.deal(strategy.population_size, strategy.antithetic),
             evaluations=dataclasses.replace(strategy.evaluations, num_incumbent_evals=num_evals),
         )
 
     @property
     def agent_of(self) -> PerGroup[np.ndarray]:
-        """The number of each training's agent: in the population, and on the incumbent."""
-        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates), int)
-        for agent_index, numbers in enumerate(self.candidates):
+        """The number of each training's agent, `[training]`: the last row of the table above."""
+        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
+        for agent_index, numbers in enumerate(self.candidates_of):
             of_candidate[numbers] = agent_index
-        turns = np.arange(self.evaluations.num_incumbent_evals)
         of_population = np.repeat(of_candidate, self.evaluations.num_evals)
-        return PerGroup(of_population, turns % self.mixture.size)
+        of_incumbent = np.arange(self.evaluations.num_incumbent_evals) % self.mixture.size
+        return PerGroup(of_population, of_incumbent)
 
     def trainings_of(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all trainings of a generation."""
@@ -137,7 +137,7 @@ class Scoring:
         scores = self._scores(self.objective(outcome))
         by_candidate = scores.population.reshape(-1, self.evaluations.num_evals)
         population = self.evaluations.population_scores(by_candidate)
-        return self.mixture.comparable(population, self.candidates, scores.agent_means)
+        return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
 
     def for_people(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
@@ -175,9 +175,10 @@ class Scoring:
         agent_of, means = self.agent_of, []
         population, incumbent = jnp.split(scores, [agent_of.population.size])
         for agent_index in range(self.mixture.size):
-            tried, turns = (np.flatnonzero(group == agent_index) for group in agent_of)
-            repaired, mean = self.evaluations.incumbent_scores(incumbent[turns], population[tried])
-            incumbent = incumbent.at[turns].set(repaired)
+            in_population, on_incumbent = (np.flatnonzero(x == agent_index) for x in agent_of)
+            of_agent = incumbent[on_incumbent], population[in_population]
+            repaired, mean = self.evaluations.incumbent_scores(*of_agent)
+            incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min

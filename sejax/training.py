@@ -234,10 +234,13 @@ def make_trainer(
 def num_parallel_on_cpu(
     agent: Agent, training: TrainingConfig, num_agents: int = LARGEST
 ) -> int | None:
-    """Agents in a vmapped batch of a CPU core; None for all; 1 if each may stop at its own time."""
+    """Agents in a vmapped batch of a CPU core; None for all, as with tabular agents.
+
+    Other agents train one by one if each may stop at its own time.
+    """
     width = agent.spec.cpu_num_parallel
     if width is None or not training.is_fixed_length:
-        return width and 1
+        return None if width is None else 1
     return min(width, cpu.width_of(num_agents))
 
 
@@ -262,7 +265,8 @@ class _Loop:
         self.max_steps = self.buffer_steps = training.max_steps or LARGEST
         self.prepare = lambda params, hparams: params
         if (proxy := proxy_in(env)) is not None:
-            require_reachable("training", training, proxy.max_steps)
+            if self.test_fn is None:  # a curve of tests may end at either limit
+                require_reachable("training", training, proxy.max_steps)
             self.buffer_steps = min(self.max_steps, training.max_episodes * proxy.max_steps)
             self.prepare = lambda params, hparams: proxy.prepare(
                 params, agent.discount(hparams), limit_is_terminal
@@ -331,6 +335,7 @@ class _Loop:
 
         def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
             large, state = carry
+            # Masked always: the training may end within these steps.
             large, stepped = self.step(large, state, consts, masked=True, learns=False)
             return large, jax.tree.map(partial(jnp.where, state.active), stepped, state)
 
@@ -417,7 +422,7 @@ class _Loop:
     def end_episode(
         self, keys: _StepKeys, state: _LoopState, env_params: PyTree, finished: Array
     ) -> _LoopState:
-        """Records the episode, decides whether training goes on, and starts the next one.
+        """Tests and judges the episode, and starts the next one; `step` records it.
 
         Under `vmap` this runs for all agents if it runs for one. Only agents that have `finished`
         are tested.

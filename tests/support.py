@@ -1,6 +1,7 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
 import csv
+import dataclasses
 import functools
 import math
 import os
@@ -31,6 +32,12 @@ ROOM = [
 def paper_se(**fields):
     """The paper's SE, of whole episodes, but for these fields."""
     return SyntheticConfig(**{"initial_state": "real", "horizon": None, "done": "soft"} | fields)
+
+
+def paper_ppo(**fields):
+    """The paper's PPO, but for these fields."""
+    words = ["env=mountain_car_continuous", "proxy=rn", "agent=ppo", "preset=paper"]
+    return dataclasses.replace(config(words).agent, **{"action_repeat": 1} | fields)
 
 
 def paper_training(**fields):

@@ -125,7 +125,7 @@ def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     (trainings,), (run,) = program.evaluate.trainings(candidates), program.evaluate.evaluators
     of_vectors = dataclasses.replace(candidates, test_params=jnp.arange(2))  # a leaf may have axes
     (repeated,) = program.evaluate.trainings(of_vectors)
-    np.testing.assert_array_equal(repeated.test_params, [[0, 1]] * len(trainings.candidate))
+    np.testing.assert_array_equal(repeated.test_params, [[0, 1]] * len(trainings.weights))
     outcome = jax.jit(lambda: jax.lax.map(run, trainings))()
     assert (outcome.scored_returns != outcome.test_returns).any()
     after, info = jax.jit(program.generation)(state)
@@ -167,6 +167,11 @@ def test_a_learner_vmapped_over_keys_equals_separate_runs(room):
     for i, (states, infos) in enumerate(runs):
         result = jax.tree.map(lambda x, i=i: x[i], results)
         assert_result_equals_run(result, program, states, infos, rtol=1e-4, atol=1e-5)
+
+
+def test_a_curve_may_end_at_either_limit():
+    words = ["env=cartpole", "proxy=rn", "objective=auc", "training.max_steps=100000"]
+    assert make_bilevel(**sejax.config(words).parts())
 
 
 def test_four_lanes_give_the_same_numbers_as_one(room):

@@ -11,7 +11,7 @@ import gymnax
 import jax
 import pandas as pd
 import pytest
-from support import evaluation, paper_se, paper_training, refusal, refused
+from support import evaluation, paper_ppo, paper_se, paper_training, refusal, refused
 
 import sejax
 from sejax import envs
@@ -106,7 +106,7 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
     (then,), training = proxy.learned_agents().values(), sejax.training_of(proxy)
     waits = dataclasses.replace(then, warmup_episodes=3)
-    long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
+    long, short = (paper_ppo(update_episodes=number) for number in (2, 1))
     for agent, learned_with, length, budget in (
         (then, [then], 200, 50), (waits, [then], 200, 50 + 3 * 200), (long, [then], 200, 50 + 401),
         (then, [], 200, 50),  # nobody knows what it was learned with

@@ -8,18 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_shares, drawing, numpy_forward, raveled, refused, unraveled
+from support import assert_shares, drawing, numpy_forward, paper_ppo, raveled, refused, unraveled
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.ppo import MIN_STD, PPO, ContinuousPPO, PPOConfig, shuffled, std_of
+from sejax.agents.ppo import MIN_STD, PPO, ContinuousPPO, shuffled, std_of
 from sejax.ops.scores import merged_moments
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
 ENDS = (3, 4, 9)  # last steps of episodes; the rollout is cut within the fourth
 GOLDEN = Path(__file__).parent / "golden" / "ppo_updates.npz"
-CONFIG = PPOConfig.paper(
+CONFIG = paper_ppo(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
@@ -152,7 +152,7 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
     max_steps, decisions, time_step = 50, 0, 0
     while not time_step / max_steps > update_episodes:
         decisions, time_step = decisions + 1, time_step + action_repeat
-    config = PPOConfig.paper(update_episodes=update_episodes, action_repeat=action_repeat)
+    config = paper_ppo(update_episodes=update_episodes, action_repeat=action_repeat)
     assert config.rollout_length(max_steps) == decisions
     given = dataclasses.replace(config, rollout_steps=17)
     assert given.rollout_length(max_steps) == 17

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
+from support import paper_ppo
 
 import sejax
 from sejax import envs
@@ -63,7 +64,7 @@ AGENTS = {
     ),
     "sac": sejax.SACConfig(**ACTOR_CRITIC, alpha=0.05),
     "ppo": sejax.PPOConfig(hidden_size=16, num_layers=1),
-    "paper_ppo": sejax.PPOConfig.paper(**SMALL, rollout_steps=64, epochs=5),
+    "paper_ppo": paper_ppo(**SMALL, rollout_steps=64, epochs=5),
 }
 
 
@@ -108,7 +109,7 @@ CURVES = {  # task, agent, training, and the least mean test return
     ),
     "ppo": (
         "cartpole",
-        sejax.PPOConfig.paper(activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20,
+        paper_ppo(activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20,
                               discount=0.98),
         TrainingConfig(max_steps=80_000, stop_rule="never"), 195,
     ),

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import pytest
 import yaml
-from support import ROOM, ended, is_drawn
+from support import ROOM, ended, is_drawn, refused
 from support import metrics as rows
 
 import sejax
@@ -287,6 +287,11 @@ def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
     (count,) = re.findall(r"(\d+) generations are saved in .* resumes from there", ended.stdout)
     assert int(count) == len(rows(tmp_path)) >= 2 and (tmp_path / "proxy.safetensors").exists()
     assert f"Resuming at generation {count}" in learn(tmp_path, f"generations={int(count) + 1}")
+
+
+def test_a_sweep_with_a_run_that_cannot_be_begins_none(tmp_path):
+    words = ["agent=ppo", "agent.num_minibatches=4,1000", f"run_dir={tmp_path}/a"]
+    assert refused(run.main, words) == "agent.num_minibatches" and not (tmp_path / "a").exists()
 
 
 def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, capsys):

@@ -64,6 +64,15 @@ class Study:
 
 
 # Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
+
+
+def _paper_ppo(env: str) -> sejax.PPOConfig:
+    """The paper's PPO for showing transfer of RNs."""
+    words = [f"env={env}", "proxy=rn", "agent=ppo", "preset=paper"]
+    ppo: sejax.PPOConfig = sejax.config(words).agent
+    return ppo
+
+
 _CARTPOLE: dict[str, Any] = {
     "warmup_episodes": 1,
     "batch_size": 32,
@@ -99,10 +108,13 @@ STUDIES = {
     ),
     "mountain_car_continuous": Study(
         agent=None,
-        transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
+        transfer_agent=_paper_ppo("mountain_car_continuous"),
         # docs/agents.md, "PPO"
-        tuned_agent=sejax.PPOConfig.paper(
-            action_repeat=5, rollout_steps=256, learning_rate=0.0015, init_action_std=1.0
+        tuned_agent=dataclasses.replace(
+            _paper_ppo("mountain_car_continuous"),
+            rollout_steps=256,
+            learning_rate=0.0015,
+            init_action_std=1.0,
         ),
         rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
@@ -111,15 +123,7 @@ STUDIES = {
     ),
     "halfcheetah": Study(
         agent=None,
-        transfer_agent=sejax.PPOConfig.paper(
-            hidden_size=128,
-            activation="tanh",
-            learning_rate=1e-5,
-            update_episodes=1,
-            epochs=10,
-            entropy_weight=0.001,
-            init_action_std=0.1,
-        ),
+        transfer_agent=_paper_ppo("halfcheetah"),
         bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000,

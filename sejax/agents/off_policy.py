@@ -72,7 +72,7 @@ class ActorCriticOptions(OffPolicyOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    learning_rate: Positive = 3e-3
+    learning_rate: Positive = 3e-3  # traced and varied, as in the base class
     action_repeat: Count = 1
 
     def spec(self) -> AgentSpec:

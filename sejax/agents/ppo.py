@@ -17,7 +17,7 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,8 @@ _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions.
 
-    The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
+    The defaults learn from few steps (`docs/agents.md`). The paper's PPO is that of
+    `env=mountain_car_continuous proxy=rn preset=paper`; see `docs/reference.md` 4.5.
 
     Attributes:
       rollout_steps: Decisions between two learning phases; null: as `update_episodes` says.
@@ -91,34 +92,6 @@ class PPOConfig(AgentOptions):
     adam_eps: Positive = 1e-5
     init_action_std: Positive = 0.5
     action_repeat: Count = 1
-
-    @classmethod
-    def paper(cls, **changes: Any) -> Self:
-        """The paper's PPO with `changes`: by its table and, where the table is silent, its code.
-
-        The values are those for MountainCarContinuous, whose RNs add `action_repeat=5`.
-
-        Source: the paper's appendix, tables of PPO; `docs/reference.md` 4.5.
-
-        Example:
-          >>> PPOConfig.paper(epochs=20).advantages
-          'monte_carlo'
-        """
-        paper: dict[str, Any] = {
-            "advantages": "monte_carlo",
-            "normalize_rewards": False,
-            "rollout_steps": None,
-            "num_minibatches": 1,
-            "epochs": 80,
-            "activation": "relu",
-            "learning_rate": 3e-4,
-            "clip_ratio": 0.2,
-            "value_weight": 1.0,
-            "max_grad_norm": None,
-            "adam_eps": 1e-8,
-            "gae_lambda": 0.95,
-        }
-        return cls(**(paper | changes))
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""

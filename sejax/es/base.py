@@ -26,9 +26,9 @@ class PerGroup(NamedTuple, Generic[T]):
     """Values for the two groups of trainings in a generation.
 
     Attributes:
-      population: for the candidates' evaluations; arrays are `[pop, evaluation, ...]`.
-      incumbent: for the incumbent's evaluations; each turn has one with each agent of a mixture;
-        arrays are `[turn, agent, ...]`.
+      population: for the trainings on candidates; keys are `[pop, evaluation]`.
+      incumbent: for those on the incumbent; each turn has one with each agent of a mixture; keys
+        are `[turn, agent]`.
     """
 
     population: T
@@ -42,7 +42,7 @@ class Evaluations:
     Attributes:
       num_evals: evaluations for each candidate of the population.
       aggregate: how the scores of a candidate's evaluations become one score: mean or min.
-      num_incumbent_evals: evaluations of the incumbent.
+      num_incumbent_evals: trainings on the incumbent.
       common_random_numbers: whether the r-th evaluation of every candidate has the same seed, the
         incumbent's with each agent too.
     """
