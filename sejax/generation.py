@@ -117,6 +117,7 @@ class GenerationEvaluator:
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
+            # Not raveled: keys of `jax.random.PRNGKey` have an axis more.
             keys_population = jax.lax.collapse(keys.population[numbers], 0, 2)
             trainings = Trainings(
                 key=jnp.concatenate([keys_population, keys.incumbent[:, agent_index]]),

@@ -12,7 +12,7 @@ import pytest
 from support import refused
 
 import sejax
-from sejax.distill import folder_of, main, read
+from sejax.distill import evaluations_of, folder_of, main, read
 from sejax.distillation import policies, teaching
 from sejax.proxies import header, zoo
 
@@ -116,6 +116,11 @@ def test_a_function_that_has_changed_gets_students_of_its_own(tmp_path, monkeypa
         assert pd.read_csv(tmp_path / "students.csv")["policy_return"].unique() == returns[-1:]
     assert returns[0] == 200.0 > returns[1]
     assert len(list((tmp_path / "students").iterdir())) == 2
+
+
+def test_an_algorithm_whose_students_diverge_counts_as_the_worst():
+    rows = pd.DataFrame({"agent": ["a", "b"], "test_return": [np.nan, 3.0], "train_steps": [1, 1]})
+    assert [x["return_mean"] for x in evaluations_of(rows)] == [3.0, 3.0]
 
 
 def test_an_agent_is_trained_once_and_its_steps_are_counted(tmp_path, monkeypatch):

@@ -63,9 +63,6 @@ class Study:
     num_agents: int = 10  # on each of these
 
 
-# Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
-
-
 def _paper_ppo(env: str) -> sejax.PPOConfig:
     """The paper's PPO for showing transfer of RNs."""
     words = [f"env={env}", "proxy=rn", "agent=ppo", "preset=paper"]
@@ -73,6 +70,7 @@ def _paper_ppo(env: str) -> sejax.PPOConfig:
     return ppo
 
 
+# Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
 _CARTPOLE: dict[str, Any] = {
     "warmup_episodes": 1,
     "batch_size": 32,

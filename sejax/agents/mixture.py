@@ -112,6 +112,7 @@ class Mixture:
             behind = shares * (candidate + 1) - [len(hand) for hand in hands]
             hands[int(np.argmax(behind))].append(candidate)
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
+        # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
         field, size = "es.population_size", 2 * int(1 / shares[shares > 0].min() + self.size + 1)
         got = f"got {num_dealt} perturbations for weights {shortened(self.weights)}"
         require(are_enough, field, f"must leave each agent one; {got}. Set {field}={size}.")
