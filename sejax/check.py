@@ -18,7 +18,7 @@ import contextlib
 import dataclasses
 import functools
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -39,12 +39,13 @@ from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of,
 from sejax.myopia import ENOUGH, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import LARGEST, Count, as_text, registry, require
-from sejax.options.plain import configure, plugin
+from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
+from sejax.runs.chunks import Pool
 from sejax.runs.config import REAL_TRAINING
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
@@ -59,6 +60,7 @@ FREE = {"devices", "machines", "out_dir", "num_agents"}  # may change when a com
 MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
 SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
+Trainings: TypeAlias = dict[str, TrainingConfig]  # by agent
 Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
 
 
@@ -70,6 +72,7 @@ class CheckConfig(EvaluateConfig):
       machines: where agents train
       algorithms: Other agents than those it was learned with, with default hyperparameters; null:
         all that fit the task.
+      out_dir: null: runs/check-<proxy>
       null_steps: real steps, at least one generation, of a random search for a policy, and of a PPO
         that follows if the search does not solve the task
     """
@@ -143,19 +146,25 @@ def run(config: CheckConfig) -> dict[str, Any]:
     on_proxy, on_task = (x._replace(is_varied=False) for x in setup_of(config)[0].values())
     name = as_file_name(config.proxy.removesuffix(".safetensors"))
     folder = Path(config.out_dir or f"runs/check-{name}")
-    settings = config.plain() | {"proxy": proxy.fingerprint, "task": task.origin}
+    settings = config.plain() | {"task": task.origin, "discount": proxy.discount}
+    settings["proxy"] = {"weights": proxy.fingerprint} | to_plain(proxy.env.config, "proxy")
+    settings["trainings"] = to_plain(on_proxy.trainings)
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
-    with Store(folder, settings, field="out_dir", free=FREE) as store:
-        null = dict[str, Any]()
+    store = Store(folder, settings, field="out_dir", free=FREE)
+    with store, config.machines.pool() as pool:
+        table, null = _trained(config, rows, store, pool), dict[str, Any]()
+        rows, known = {}, [*learned, *others]
         if not proxy.env.is_real and task.num_states is None:
-            world, null = _null(config, task, on_proxy, store)
-            rows[NULL] = world, [*learned, *others]
+            steps, trainings = table.groupby("agent")["train_steps"].mean(), on_proxy.trainings
+            lengths = {key: trainings[key].max_steps or ceil(steps[key]) for key in known}
+            world, null = _null(config, task, _of_lengths(trainings, lengths), store)
+            rows[NULL] = world, known
         rows[TASK] = on_task, [*learned][: None if proxy.env.is_real else 1]
-        untrained = dict.fromkeys(learned, TrainingConfig(max_steps=1, max_episodes=1))
         rows[TUNED] = on_task, [tuned]
+        untrained = _of_lengths(on_task.trainings, dict.fromkeys(learned, 1))
         rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
-        table = _trained(config, rows, store)
+        table = pd.concat([table, _trained(config, rows, store, pool)], ignore_index=True)
         return _reported(proxy, null, [*learned], table, folder)
 
 
@@ -173,19 +182,34 @@ def _tuned(task: Task) -> AgentConfig:
     return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)
 
 
+def _of_lengths(trainings: Trainings, num_steps: Mapping[str, int]) -> Trainings:
+    """Trainings of as many steps, by agent, with the tests of the given ones."""
+    return {
+        key: TrainingConfig(max_steps=x, max_episodes=x, test_episodes=trainings[key].test_episodes)
+        for key, x in num_steps.items()
+    }
+
+
 def _null(
-    config: CheckConfig, task: Task, on_proxy: World, store: Store
+    config: CheckConfig, task: Task, trainings: Trainings, store: Store
 ) -> tuple[World, dict[str, Any]]:
     """A one-step SE made of a cheap policy; agents train on it as long as on the proxy.
 
     A random search finds the policy. If it does not solve the task, a PPO is trained too, and the
     better policy is taken.
+
+    Args:
+      config: of the command.
+      task: the real task.
+      trainings: of the agents.
+      store: where the search is kept.
     """
     uses = ("search", "test", "record")
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), 3), strict=True))
     # A generation has 2 * 16 + 1 episodes and 10 tests.
     generations = max(1, config.null_steps // (43 * task.max_steps))
-    search = SearchConfig(**ARS, generations=generations, until_solved=True)
+    fields = ARS | {"alive_bonus": dict[str, Any](task.origin or {}).get("healthy_reward", 0.0)}
+    search = SearchConfig(**fields, generations=generations, until_solved=True)
     (lesson,), costs = searched(search, task, 1, keys, store, config.devices)
     method, steps = "a random search", costs["real_steps"].sum()
     if lesson.policy_return < task.solved_reward:
@@ -194,24 +218,21 @@ def _null(
         steps += costs["real_steps"].sum()
         method, lesson = max(((method, lesson), ("a PPO", other)), key=lambda x: x[1].policy_return)
     env, weights = make_exact(task, lesson.layers, lesson.states)
-    limits = {key: x.max_steps or 2000 for key, x in on_proxy.trainings.items()}
-    trainings = {key: TrainingConfig(max_steps=x, max_episodes=x) for key, x in limits.items()}
     about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
     return World(env, env.params(weights), task, trainings), about
 
 
-def _trained(config: CheckConfig, rows: Rows, store: Store) -> pd.DataFrame:
+def _trained(config: CheckConfig, rows: Rows, store: Store, pool: Pool) -> pd.DataFrame:
     """A line for each agent. Missing results are computed, a row at a time, and stored."""
     tables = []
-    with config.machines.pool() as pool:
-        for row, (world, keys) in rows.items():
-            names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
-            missing = [key for key, name in names.items() if store.get(name) is None]
-            print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
-            results = iter(pool(train, [(config, world, key) for key in missing]))
-            for key, name in names.items():
-                columns = store.once(name, functools.partial(next, results))
-                tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
+    for row, (world, keys) in rows.items():
+        names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
+        missing = [key for key, name in names.items() if store.get(name) is None]
+        print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
+        results = iter(pool(train, [(config, world, key) for key in missing]))
+        for key, name in names.items():
+            columns = store.once(name, functools.partial(next, results))
+            tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
     return pd.concat(tables, ignore_index=True)
 
 

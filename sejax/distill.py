@@ -26,7 +26,7 @@ from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import ConfigError, Count, Options, field_lines, shortened
+from sejax.options import ConfigError, Count, Options, field_lines, require, shortened
 from sejax.options.plain import flatten, from_plain, merge, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -125,6 +125,8 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         raise ConfigError(f"{shortened(name, 40)} {message}", name)
     words = [f"{name}={text}" for name, text in texts.items()]
     config = configuration.config(words, StudentsConfig)
+    is_default, must = config.agent_hparams == "default", "must be default, as students have"
+    require(is_default, "agent_hparams", f"{must} fixed ones; got varied. Leave it out.")
     # The task's reward for being healthy is left out of searches.
     bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
     return from_plain(DistillConfig, merge(bonus, values), ""), config
@@ -188,7 +190,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
     learning = {
         "command": f"python -m sejax.distill {words}".rstrip(),
-        "generations": job.search.generations if job.policy is None else 0,
+        "generations": int(costs["generation"].max()) if job.policy is None else 0,
         "real_steps": int(spent["real_steps"]),
         "agents": len(rows),
         "train_steps": int(rows["train_steps"].sum()),

@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent
-from sejax.es.base import PerGroup, StrategyState
+from sejax.es.base import StrategyState
 from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import Outcome
 from sejax.ops.parallel import spread_groups_over_devices
@@ -27,7 +27,7 @@ class Candidates:
 
     population: Float[Array, "pop dims"]
     incumbent: Float[Array, " dims"]
-    keys: PerGroup[Array]  # of the trainings
+    keys: Array  # of the trainings
     active: Array  # whether anything is to be computed
     test_params: PyTree  # of `Objective.test_env`; None for the task's
     key_tell: Array
@@ -107,21 +107,18 @@ class GenerationEvaluator:
 
     def trainings(self, candidates: Candidates) -> list[Trainings]:
         """The trainings of each agent: on its candidates, and then on the incumbent."""
-        keys, shared = candidates.keys, (candidates.active, candidates.test_params)
-        by_agent = []
+        shared, by_agent = (candidates.active, candidates.test_params), []
+        weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
         num_evals = self._scoring.evaluations.num_evals
-        pairs = zip(self._scoring.candidates_of, self.num_trainings, strict=True)
-        for agent_index, (numbers, size) in enumerate(pairs):
-            population = jnp.repeat(candidates.population[numbers], num_evals, axis=0)
-            incumbent = jnp.tile(candidates.incumbent, (size - len(population), 1))
+        for agent_index, size in enumerate(self.num_trainings):
+            numbers = self._scoring.trainings_of(agent_index)
+            rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
-            # Not raveled: keys of `jax.random.PRNGKey` have an axis more.
-            keys_population = jax.lax.collapse(keys.population[numbers], 0, 2)
             trainings = Trainings(
-                key=jnp.concatenate([keys_population, keys.incumbent[:, agent_index]]),
-                weights=jnp.concatenate([population, incumbent]),
+                key=candidates.keys[numbers],
+                weights=weights[rows],
                 active=active,
                 test_params=test_params,
             )

@@ -54,9 +54,10 @@ class Judgement(NamedTuple):
 def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Judgement:
     """Compares agents with a discount of 0 to far-sighted ones, with their own discount.
 
-    - dynamics: the far-sighted agents score better by more than the margin;
-    - policy: by less than the margin, and they score above the floor by more than the margin;
-    - teaches little: they score above the floor by less than the margin, or the floor is the top;
+    - teaches little: far-sighted agents score above the floor by less than the margin, or the
+      floor is the top;
+    - dynamics: they score above it by more, and above the others by more than the margin;
+    - policy: they score above it by more, and above the others by less than the margin;
     - open: an interval contains the margin.
 
     Args:
@@ -73,12 +74,12 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     margin = MARGIN * (top - floor.mean())
     lost, gained = far - myopic, far - floor
     (low, high), (gain_low, gain_high) = mean_interval(lost), mean_interval(gained)
-    if low > margin > 0:
-        verdict = "dynamics"
-    elif high < margin < gain_low:
-        verdict = "policy"
+    if gain_high < margin or margin <= 0:
+        verdict = "teaches little"
+    elif gain_low > margin and not low <= margin <= high:
+        verdict = "dynamics" if low > margin else "policy"
     else:
-        verdict = "teaches little" if gain_high < margin or margin <= 0 else "open"
+        verdict = "open"
     halves = np.array([high - low, gain_high - gain_low]) / 2
     distances = np.abs([lost.mean() - margin, gained.mean() - margin])
     # The width of an interval falls with the square root of the number of agents.

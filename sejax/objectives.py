@@ -25,8 +25,7 @@ class Outcome:
     """The result of one agent. Leaves are `[]`, returns `[episode]`; `[agent, ...]` for many.
 
     Attributes:
-      test_returns: return of each test episode on the real task, in reward units; a single nan
-        where there was no test.
+      test_returns: return of each test episode on the real task, in reward units.
       scored_returns: returns of the same episodes, as `Objective.test_env` scores them.
       train_steps: steps in the training world.
       train_episodes: episodes in the training world.
@@ -77,19 +76,13 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """The scores that compare candidates; nan for trainings that diverged.
+    def __call__(self, outcome: Outcome, for_people: bool = False) -> Float[Array, "*agent"]:
+        """The scores that compare candidates, or those that people see; nan for diverged agents.
 
         Raises:
           ConfigError: unless there is a score for each agent.
         """
-        return self._of_each(outcome, self.score)
-
-    def shown_score(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """The scores that people see; nan likewise."""
-        return self._of_each(outcome, self.shown or self.score)
-
-    def _of_each(self, outcome: Outcome, score: Callable[[Outcome], Array]) -> Array:
+        score = (for_people and self.shown) or self.score
         scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
         must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
         require(scores.shape == shape, "objective", must)

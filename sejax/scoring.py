@@ -2,7 +2,7 @@
 
 `Scoring` applies an objective to both groups of a generation, the population and the incumbent. It
 gives the scores that the strategy compares and the scores that people see. These differ only with a
-mixture of agents, or if a curriculum (`MaxReward.first_eval_steps`) shortens the scored episodes.
+mixture of agents, or if a curriculum (`MaxReward.first_eval_steps`) scores a part of each episode.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Shaped
 
 from sejax.agents.mixture import Mixture
-from sejax.es.base import Evaluations, PerGroup, Strategy
+from sejax.es.base import Evaluations, Strategy
 from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
 
@@ -115,18 +115,18 @@ class Scoring:
         )
 
     @property
-    def agent_of(self) -> PerGroup[np.ndarray]:
+    def agent_of(self) -> np.ndarray:
         """The number of each training's agent, `[training]`: the last row of the table above."""
         of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
         for agent_index, numbers in enumerate(self.candidates_of):
             of_candidate[numbers] = agent_index
         of_population = np.repeat(of_candidate, self.evaluations.num_evals)
         of_incumbent = np.arange(self.evaluations.num_incumbent_evals) % self.mixture.size
-        return PerGroup(of_population, of_incumbent)
+        return np.concatenate([of_population, of_incumbent])
 
     def trainings_of(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all trainings of a generation."""
-        return np.flatnonzero(np.concatenate(self.agent_of) == agent_index)
+        return np.flatnonzero(self.agent_of == agent_index)
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
@@ -141,7 +141,7 @@ class Scoring:
 
     def for_people(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
-        return self._scores(self.objective.shown_score(outcome))
+        return self._scores(self.objective(outcome, for_people=True))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
@@ -172,11 +172,13 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        agent_of, means = self.agent_of, []
-        population, incumbent = jnp.split(scores, [agent_of.population.size])
+        means, num_in_population = [], scores.size - self.evaluations.num_incumbent_evals
+        population, incumbent = jnp.split(scores, [num_in_population])
         for agent_index in range(self.mixture.size):
-            in_population, on_incumbent = (np.flatnonzero(x == agent_index) for x in agent_of)
-            of_agent = incumbent[on_incumbent], population[in_population]
+            numbers = self.trainings_of(agent_index)
+            is_on_candidate = numbers < num_in_population
+            on_incumbent = numbers[~is_on_candidate] - num_in_population
+            of_agent = incumbent[on_incumbent], population[numbers[is_on_candidate]]
             repaired, mean = self.evaluations.incumbent_scores(*of_agent)
             incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)

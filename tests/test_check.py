@@ -1,5 +1,6 @@
 """`python -m sejax.check`: is a learned environment more than a policy?"""
 
+import dataclasses
 import importlib
 import json
 import pickle
@@ -61,6 +62,9 @@ def test_as_many_more_agents_decide_as_are_said():
     myopic, far = np.tile([0.0, 100.0], 10), np.full(20, 100.0)
     few = judge(myopic, far, 0.0, 100.0)
     assert judge(far, far, 110.0, 100.0).verdict == "teaches little"  # untrained agents solve it
+    rn = np.linspace(-3000, -2000, 20)  # which takes as many steps as its task: no gain
+    assert judge(rn - 9000, rn, rn, 0.0).verdict == "teaches little"
+    assert judge(rn - 9000, rn, rn - 3000, 0.0).verdict == "dynamics"
     assert few.verdict == "dynamics"
     near = judge(np.tile([70.0, 100.0], 10), far, 0.0, 100.0)  # loses 15, the margin is 10
     assert near.verdict == "open"
@@ -123,6 +127,10 @@ def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     np.testing.assert_array_equal(one["test_return"], two["test_return"])
     shutil.copytree(out, tmp_path / "other")
     assert refused(run, path, out_dir=tmp_path / "other", seed=1) == "out_dir"
+    proxy = sejax.load_proxy(path)  # the same weights, but of another SE
+    env = dataclasses.replace(proxy.env.config, min_steps=3).make(proxy.task)
+    sejax.save(path := tmp_path / "mine.safetensors", env, proxy.params.weights, proxy.config)
+    assert refused(run, path, out_dir=tmp_path / "other") == "out_dir"
 
 
 def test_a_reward_network_is_judged_by_training_steps(tmp_path):
@@ -147,11 +155,10 @@ def test_what_cannot_be_judged_is_refused(fields, field, whole, tmp_path, monkey
 
 def test_no_agents_have_random_hyperparameters(tmp_path, monkeypatch):
     """A discount of 0 would be drawn again, and rows would compare different agents."""
-    rows = []
-    monkeypatch.setattr(checking, "_trained", lambda config, of_check, store: rows.append(of_check))
-    monkeypatch.setattr(checking, "_reported", lambda *_: {})
+    worlds, train = [], checking.train
+    monkeypatch.setattr(checking, "train", lambda *x: worlds.append(x[1]) or train(*x))
     run(save(tmp_path / "x.safetensors", *WHOLE, "agent_hparams=varied"), out_dir=tmp_path / "out")
-    assert rows[0] and not any(world.is_varied for world, _ in rows[0].values())
+    assert worlds and not any(world.is_varied for world in worlds)
 
 
 def test_damaged_files_and_tasks_that_are_not_here_are_refused(whole, tmp_path, monkeypatch):

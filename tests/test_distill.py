@@ -170,6 +170,8 @@ def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
     task = SimpleNamespace(name="uneven", num_actions=None, action_dim=2, max_action=1.0)
     act = policies.policy_of("sac:model.zip", task, 1, jax.random.key(0))
     np.testing.assert_allclose(act(np.zeros((3, 5))), [[0.0, 1.0]] * 3)
+    model.action_space = SimpleNamespace(n=2)
+    assert refused(policies.policy_of, "sac:model.zip", task, 1, jax.random.key(0)) == "policy"
 
 
 def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
@@ -177,6 +179,8 @@ def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
     config = read([f"preset={file}"])[1]
     assert (*config.agents, config.training.max_steps) == ("ppo", 777)
     assert (config.preset, config.agent.rollout_steps) == ("distilled", 256)
+    file.write_text("{env: pendulum, agent_hparams: varied}")  # which students have not
+    assert refused(read, [f"preset={file}"]) == "agent_hparams"
 
 
 def test_defaults_are_those_of_the_task():

@@ -21,19 +21,18 @@ def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
     for shared in (False, True):
         strategy = dataclasses.replace(config, common_random_numbers=shared).make(6)
         size = strategy.population_size
-        population, incumbent = strategy.evaluations.keys(jax.random.key(0), size)
-        assert (population.shape, incumbent.shape) == ((size, 2), (3, 1))
-        seeds = [np.asarray(jax.random.key_data(keys)) for keys in (population, incumbent)]
-        num_seeds = len(np.unique(np.concatenate([x.reshape(-1, 2) for x in seeds]), axis=0))
-        assert num_seeds == (3 if shared else 2 * size + 3)
+        keys = strategy.evaluations.keys(jax.random.key(0), size)
+        seeds = np.asarray(jax.random.key_data(keys))
+        assert len(seeds) == 2 * size + 3
+        assert len(np.unique(seeds, axis=0)) == (3 if shared else len(seeds))
         if shared:  # two for each candidate, which are the first two of the incumbent
-            np.testing.assert_array_equal(seeds[0], np.tile(seeds[1][None, :2, 0], (size, 1, 1)))
+            np.testing.assert_array_equal(seeds[:-3], np.tile(seeds[-3:-1], (size, 1)))
 
 
 def test_with_common_random_numbers_all_agents_of_a_mixture_have_the_populations():
     evaluations = Evaluations(num_evals=2, num_incumbent_evals=6, common_random_numbers=True)
-    population, incumbent = evaluations.keys(jax.random.key(0), 4, num_agents=2)
-    assert (incumbent[:2] == jnp.stack([population[3]] * 2, axis=1)).all()
+    keys = evaluations.keys(jax.random.key(0), 4, num_agents=2)
+    assert (keys[8:12] == keys[jnp.array([6, 6, 7, 7])]).all()  # the population's are 0 to 7
 
 
 # --- what is evaluated, and its scores -----------------------------------------------------------

@@ -383,6 +383,7 @@ def make():
 
 if __name__ == "__main__":
     sejax.gym.make("cartpole-rn").reset(seed=0)
+    sejax.gym.make("cliff_walking-rn")
     envs = AsyncVectorEnv([make], context="CONTEXT")
     envs.reset(seed=0)
     loaded = {"stable_baselines3", "torch"} & set(sys.modules)
@@ -424,6 +425,7 @@ def test_an_unknown_task_must_be_given(stored):
         assert refused(make, path, given) == "task"
     images = dataclasses.replace(mine, observation_space=spaces.Box(0, 1, (2, 2)))
     assert refused(make, path, images) == "task"
+    assert refused(make, stored(jax_se("cliff_walking")), "FrozenLake-v1") == "task"  # fewer cells
 
 
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):

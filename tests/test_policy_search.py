@@ -20,6 +20,7 @@ from sejax.distillation.policy_search import (
     with_moments,
 )
 from sejax.distillation.teaching import grades
+from sejax.envs.wrappers import Wrapper
 from sejax.runs.store import Store
 
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
@@ -143,6 +144,13 @@ def test_errors_have_their_size_and_do_not_depend_on_who_has_ended():
 def test_visits_are_whole_episodes():
     states, mean_return = visit(CARTPOLE, lambda obs: np.zeros(len(obs)), jax.random.key(0), 5)
     assert 5 * mean_return == len(states) and mean_return < 15  # pushed to one side all the time
+
+    class Short(Wrapper):
+        def is_truncated(self, state, params):
+            return state.time >= 3
+
+    task = dataclasses.replace(CARTPOLE, env=Short(CARTPOLE.env))
+    assert len(visit(task, lambda obs: np.zeros(len(obs)), jax.random.key(0), 5)[0]) == 15
 
 
 # --- what SEs teach ------------------------------------------------------------------------------

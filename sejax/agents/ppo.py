@@ -2,7 +2,7 @@
 
 There are two ways to prepare a rollout (`PPOConfig.advantages`): `gae`, the usual generalised
 advantages, and `monte_carlo`, the returns of the paper's code. The paper's code learns from the
-whole rollout in each Adam step (`PPOConfig.paper`). All else is the same.
+whole rollout in each Adam step (`preset=paper`). All else is the same.
 
 Without exploration the agent takes its most probable action. Differs: the authors also test with
 sampled actions (`docs/reference.md` 3.7). They do not clip actions, so that MountainCarContinuous

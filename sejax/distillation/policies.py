@@ -120,6 +120,8 @@ def _of_sb3(text: str, task: Task) -> Actor:
         raise ConfigError(message, "policy") from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     is_discrete, space = task.num_actions is not None, model.action_space
+    must = f"must have the actions of {task.name}; got {shortened(space)}"
+    require(hasattr(space, "n") == is_discrete, "policy", f"{must}. {FIX}")
     low, high = np.asarray((-1, 1) if is_discrete else (space.low, space.high), float)
     middle, factor = (low + high) / 2, 2 * task.max_action / (high - low)
     return lambda obs: (model.predict(obs, deterministic=True)[0] - middle) * factor
@@ -246,9 +248,9 @@ def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray
         seen.append(np.asarray(obs)[active])
         action = np.asarray(act(np.asarray(obs))).astype(dtype)
         keys = jax.random.split(jax.random.fold_in(key_steps, i), episodes)
-        obs, state, reward, terminated = step(keys, state, action)
+        obs, state, reward, is_over = step(keys, state, action)
         returns += np.where(active, np.asarray(reward, float), 0.0)
-        active &= ~np.asarray(terminated)
+        active &= ~np.asarray(is_over)
         if not active.any():
             break
     return np.concatenate(seen), float(returns.mean())
@@ -259,7 +261,12 @@ def _stepper(task: Task) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Two compiled functions: the resets of many episodes, and a step of each."""
     env, params = task.env, task.params
     reset = jax.jit(jax.vmap(lambda key: env.reset_env(key, params)))
-    return reset, jax.jit(jax.vmap(lambda key, state, x: env.step_env(key, state, x, params)[:4]))
+
+    def step(key: Array, state: PyTree, action: Array) -> tuple[Array, PyTree, Array, Array]:
+        obs, state, reward, terminated, _ = env.step_env(key, state, action, params)
+        return obs, state, reward, terminated | env.is_truncated(state, params)
+
+    return reset, jax.jit(jax.vmap(step))
 
 
 def fit(

@@ -50,8 +50,8 @@ class Wrapper(Environment[State, Params]):
 class ActionRepeat(Wrapper[EnvState, EnvParams]):
     """An environment in which each decision lasts `num_repeats` steps, or to the episode's end.
 
-    Rewards add up undiscounted, and `info["sejax_num_steps"]` says how many steps were made. State,
-    parameters and spaces are the wrapped environment's.
+    Rewards add up undiscounted, `info["sejax_num_steps"]` says how many steps were made, and other
+    entries are the last step's. State, parameters and spaces are the wrapped environment's.
 
     Source: paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3" (number of action
     repeats); `docs/reference.md` 1.8. There an SE is stepped on after its episode has ended; here
@@ -193,8 +193,9 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
       ConfigError: for a space that is no box and not discrete, or actions without bounds.
     """
     observation, action = spaces_of(env, params)
-    shape = env.action_space(params).shape
     is_own = isinstance(env, Environment) and env.spaces is not None
+    # Spaces of gymnax only where they are needed: importing them starts jax's backend.
+    shape = (action.size,) if is_own else env.action_space(params).shape
     has_plain_obs = is_own or isinstance(observation, Discrete)
     if not has_plain_obs:  # a real observation tells; a space may be wrong (gymnax's FourRooms)
         came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -18,21 +18,7 @@ NumMembers = Annotated[int, Field(ge=2, le=100_000)]
 # Larger steps or noise lead to weights whose products are not finite.
 Scale = Annotated[float, Field(ge=LEAST, le=1e6)]
 
-T = TypeVar("T")
 StrategyState: TypeAlias = PyTree  # only the strategy reads it
-
-
-class PerGroup(NamedTuple, Generic[T]):
-    """Values for the two groups of trainings in a generation.
-
-    Attributes:
-      population: for the trainings on candidates; keys are `[pop, evaluation]`.
-      incumbent: for those on the incumbent; each turn has one with each agent of a mixture; keys
-        are `[turn, agent]`.
-    """
-
-    population: T
-    incumbent: T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +38,8 @@ class Evaluations:
     num_incumbent_evals: int = 16
     common_random_numbers: bool = False
 
-    def keys(self, key: Array, population_size: int, num_agents: int = 1) -> PerGroup[Array]:
-        """A key for each training of a generation.
+    def keys(self, key: Array, population_size: int, num_agents: int = 1) -> Array:
+        """A key for each training of a generation, `[training]`, in the order of `Scoring`.
 
         Args:
           key: of the generation.
@@ -67,11 +53,8 @@ class Evaluations:
             of_incumbent = of_incumbent // num_agents
         else:
             of_incumbent = of_incumbent + of_population.size
-        fold_in = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (None, 0))
-        return PerGroup(
-            population=fold_in(key, of_population.reshape(population_size, self.num_evals)),
-            incumbent=fold_in(key, of_incumbent.reshape(-1, num_agents)),
-        )
+        numbers = np.concatenate([of_population, of_incumbent])
+        return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
     def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
         """A score for each candidate; not finite if the score of one evaluation is not finite."""

@@ -7,14 +7,14 @@ import gymnasium
 import numpy as np
 from gymnasium import ObservationWrapper
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
-from gymnasium.spaces import Discrete, Space, flatdim, flatten
+from gymnasium.spaces import Discrete, flatdim, flatten
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from numpy.typing import ArrayLike
 
 from sejax import envs
 from sejax.gym import networks
-from sejax.gym.tasks import Env, Info, RealTask
+from sejax.gym.tasks import Env, Info, RealTask, signature
 from sejax.options import Fraction, checked, require, shortened
 from sejax.options.plain import configure
 from sejax.proxies import MAX_ABS_VALUE
@@ -142,13 +142,8 @@ def _require_task(env: Env, header: Header) -> None:
     must = f"must be sejax's {shortened(header.task, 40)}, its observations unchanged by wrappers"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, which has other rules
-        and _signature(env.observation_space) == _signature(learned.observation_space)
-        and _signature(env.unwrapped.action_space) == _signature(learned.action_space)
+        and signature(env.observation_space) == signature(learned.observation_space)
+        and signature(env.unwrapped.action_space) == signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
     )
     require(is_same, "env", f"{must}; got {shortened(env)}.")
-
-
-def _signature(space: Space[Any]) -> tuple[object, ...]:
-    """What must be equal for two spaces to be of one task."""
-    return type(space), space.shape, flatdim(space)

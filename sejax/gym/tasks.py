@@ -137,7 +137,7 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     require(is_same, "task", f"{must}; {got}. {fix}.")
     seen, known = task.observation_space, learned.observation_space
     must = f"must have the SE's observations, {shortened(known)}; got {shortened(seen)}."
-    require((type(seen), seen.shape) == (type(known), known.shape), "task", must)
+    require(signature(seen) == signature(known), "task", must)
     return replace(task, observation_space=known)
 
 
@@ -203,6 +203,11 @@ class GridWorld(gymnasium.Env[int, int]):
 
 
 # --- spaces ---------------------------------------------------------------------------------------
+
+
+def signature(space: spaces.Space[Any]) -> tuple[object, ...]:
+    """What must be equal for two spaces to be of one task."""
+    return type(space), space.shape, space.is_np_flattenable and spaces.flatdim(space)
 
 
 def _gymnasium_space(space: Space) -> spaces.Space[Any]:

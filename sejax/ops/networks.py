@@ -163,12 +163,12 @@ def _product(a: Float[Array, "rows inner"], b: Float[Array, "inner batch"]) -> A
 class MLP(nn.Module):
     """`num_layers` hidden layers of `hidden_size` units with an activation, then a linear head.
 
-    `activation` is one of `ACTIVATIONS`. PReLU has one slope for the whole network, as in
-    the authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at 0.25
-    (proxies: the authors' NES perturbs the weights and biases of linear layers only). `layer_norm`
-    normalises each column over the units of every hidden layer but the first, before the
-    activation; its scale and bias are learned and, as in the authors' code, the same in all layers.
-    The norm covers only the units that `narrow` has left.
+    `activation` is one of `sejax.options.Activation`. PReLU has one slope for the whole network, as
+    in the authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at
+    0.25 (proxies: the authors' NES perturbs the weights and biases of linear layers only).
+    `layer_norm` normalises each column over the units of every hidden layer but the first, before
+    the activation; its scale and bias are learned and, as in the authors' code, the same in all
+    layers. The norm covers only the units that `narrow` has left.
 
     Source: paper, appendix "SE hyperparameters"; `docs/reference.md` 1.10 and 1.11.
     """

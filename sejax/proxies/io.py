@@ -307,11 +307,14 @@ def save_set(
     # `run_dir` would be a path of this machine.
     known = {"proxy": to_plain(env.config, "proxy"), "env": origin, "run_dir": None}
     try:
+        config = dict(config or {})
+        if "training" in config:  # whose fields may be left out
+            known["training"] = to_plain(from_plain(TrainingConfig, config["training"], "training"))
         stored = Header(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            config={**(config or {}), **known},
+            config={**config, **known},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],

@@ -71,8 +71,8 @@ def _devices(overrides: Sequence[str]) -> int | None:
     """The largest number of `devices=`; 1 if other machines compute the trainings."""
     with contextlib.suppress(ConfigError):  # the command raises it later
         trees = [compose.read(words, ["machines"]) for words in compose.expand(overrides)]
-        is_here = trees[0].get("machines", {}).get("name", "local") == "local"
-        counts = [str(tree.get("devices", "")) if is_here else "1" for tree in trees]
+        here = [tree.get("machines", {}).get("name", "local") == "local" for tree in trees]
+        counts = [str(x.get("devices", "")) if y else "1" for x, y in zip(trees, here, strict=True)]
         are_counts = all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts)
         return max(map(int, counts)) if are_counts else None
     return None

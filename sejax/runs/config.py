@@ -252,7 +252,7 @@ class LearnConfig(CommandConfig):
             "agent": mixture if len(learners) > 1 else learners[0],
             "proxy": registry.make("proxy", self.proxy, task),
             "es": self.es,
-            "objective": registry.make("objective", self.objective, task),
+            "objective": self.objective,
             "training": self.training,
             "stop_when_solved": self.stop_when_solved,
             "devices": self.devices,
