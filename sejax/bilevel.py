@@ -28,7 +28,7 @@ from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_minus_inf
 from sejax.options import Count, checked, require
-from sejax.options.registry import Makes, RunConfig, make, require_part
+from sejax.options.registry import Makes, make, require_part
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.scoring import GenerationInfo, Scoring
@@ -166,7 +166,7 @@ class Bilevel:
 
 
 def make_learner(
-    config: RunConfig | None = None, *, generations: int = 100, **parts: Any
+    config: Any = None, *, generations: int = 100, **parts: Any
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
@@ -193,10 +193,10 @@ def make_learner(
       (2,)
     """
     if config is not None:
-        if not isinstance(config, RunConfig) or parts:
+        if not hasattr(config, "parts") or parts:
             raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
-    checked([generations], Count, "generations", 100)
+    generations = checked([generations], Count, "generations", 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

@@ -371,10 +371,9 @@ def _evaluation_program(
     """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
     evaluate = make_evaluator(agent, env, task, training, in_batches=False)
 
-    def program(keys: Array, env_params: PyTree) -> Outcome:
+    def program(keys: Array, env_params: PyTree) -> PyTree:
         width = num_parallel_on_cpu(agent, training, keys.shape[0])
         train = functools.partial(evaluate, env_params=env_params)
-        spread: Outcome = spread_over_devices(train, devices, num_parallel, width)(keys)
-        return spread
+        return spread_over_devices(train, devices, num_parallel, width)(keys)
 
     return jax.jit(program, compiler_options=compiler_options())

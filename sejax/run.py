@@ -73,17 +73,17 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
       OSError: if a file cannot be written; everything saved before is whole.
     """
     # The last run of a sweep must not be refused after the others have run.
-    programs = {str(x.plain() | {"seed": 0, "run_dir": None}): x for x in configs}
-    for config in programs.values() if len(programs) > 1 else ():
+    programs = [str(config.plain() | {"seed": 0, "run_dir": None}) for config in configs]
+    of_programs = dict(zip(programs, configs, strict=True))
+    for config in of_programs.values() if len(of_programs) > 1 else ():
         make_bilevel(**config.parts())
     scores, diverged = [], []
     with contextlib.ExitStack() as exit_stack:
         compiled = None
-        for config in configs:
+        for config, program in zip(configs, programs, strict=True):
             with RunDirectory(config) as directory:
                 progress = RunProgress(config)
                 try:
-                    program = dataclasses.replace(config, seed=0, run_dir=None)
                     if program != compiled:
                         exit_stack.close()
                         runtime.configure_jax()

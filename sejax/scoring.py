@@ -172,16 +172,16 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        means, num_in_population = [], scores.size - self.evaluations.num_incumbent_evals
-        population, incumbent = jnp.split(scores, [num_in_population])
+        num_in_population = scores.size - self.evaluations.num_incumbent_evals
+        all_scores, means = scores, []
         for agent_index in range(self.mixture.size):
             numbers = self.trainings_of(agent_index)
-            is_on_candidate = numbers < num_in_population
-            on_incumbent = numbers[~is_on_candidate] - num_in_population
-            of_agent = incumbent[on_incumbent], population[numbers[is_on_candidate]]
+            on_incumbent = numbers[numbers >= num_in_population]
+            of_agent = scores[on_incumbent], scores[numbers[numbers < num_in_population]]
             repaired, mean = self.evaluations.incumbent_scores(*of_agent)
-            incumbent = incumbent.at[on_incumbent].set(repaired)
+            all_scores = all_scores.at[on_incumbent].set(repaired)
             means.append(mean)
+        population, incumbent = jnp.split(all_scores, [num_in_population])
         agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
         return Scores(

@@ -99,11 +99,6 @@ def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
     assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100
 
 
-def test_an_se_is_summed_up_without_bandits():
-    row = summary("evolved", "shipped", [150] * 5)
-    assert (row.test_return_mean, row.real_steps) == (150, 7) and np.isnan(row.policy_return)
-
-
 @pytest.mark.parametrize("env", null_baselines.TEACHERS)
 def test_teachers_have_most_of_their_steps_to_learn(env):
     """Agents made for one-step SEs explore for a hundred episodes, which are whole on a task."""

@@ -241,7 +241,9 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
     ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000", "training.max_steps",
-     ""), ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
+     ""), ("training.max_steps=null training.max_episodes=1", "training.max_episodes", "=4"),
+    ("agent=ppo proxy.horizon=null training.max_steps=100", "training.max_steps", "max_steps=512"),
+    ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
     ("seeds=4", "seeds", "num_seeds?"), ("es.mirrored=yes", "es.mirrored", "be true or false"),
     ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", "any more"),
 ])  # fmt: skip

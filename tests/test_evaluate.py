@@ -20,7 +20,6 @@ from sejax.evaluate import evaluate, setup_of, summarise
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.options.plain import configure, to_plain
-from sejax.runs import plots
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
 SE = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", "proxy.done=soft",
@@ -79,18 +78,13 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
     assert "2 fresh agents of each algorithm" in printed and printed.count("sarsa") == 6
 
 
-def test_one_agent_has_no_deviation_and_a_live_line_changes_no_number(
-    tmp_path, capsys, monkeypatch
-):
-    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1"
-    for folder in ("quiet", "live"):
-        evaluate(evaluate_config(*words, f"out_dir={tmp_path / folder}"))
-        printed = capsys.readouterr().out
-        assert "nan" not in printed and "1 fresh q_learning agents" in printed
-        monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal
-    quiet, live = (tmp_path / folder / "evaluation.csv" for folder in ("quiet", "live"))
-    assert live.read_bytes() == quiet.read_bytes()
-    assert set(pd.read_csv(live).world) == {"the real task"}  # which alone can be evaluated
+def test_one_agent_has_no_deviation(tmp_path, capsys):
+    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1", f"out_dir={tmp_path}"
+    evaluate(evaluate_config(*words))
+    printed = capsys.readouterr().out
+    assert "nan" not in printed and "1 fresh q_learning agents" in printed
+    worlds = pd.read_csv(tmp_path / "evaluation.csv").world
+    assert set(worlds) == {"the real task"}  # which alone can be evaluated
 
 
 def budget_for(training, agent, learned_with, length):
@@ -266,15 +260,3 @@ def test_pickling_an_agent_says_what_to_send_in_its_place():
     agent = sejax.make_agent(sejax.DDQNConfig(hidden_size=4), sejax.envs.make("cartpole"))
     with pytest.raises(TypeError, match="Send its configuration"):
         pickle.dumps(agent)
-
-
-def test_a_picture_has_panels_only_of_what_varies(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(plots, "_write", lambda figure, path: drawn.append(figure))
-    names = ("incumbent_mean", "incumbent_std", "population_mean", "population_max")
-    for steps in ([5, 5], [5, 6]):
-        rows = [{"generation": i, "train_steps_mean": x} for i, x in enumerate(steps)]
-        rows = [row | dict.fromkeys(names, 1.0) for row in rows]
-        plots.learning_curve(rows, None, tmp_path, "cartpole, SE, ddqn")
-    assert [len(figure.axes) for figure in drawn] == [1, 2]
-    assert drawn[0].axes[0].get_title() == "cartpole, SE, ddqn"

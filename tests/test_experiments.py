@@ -234,18 +234,6 @@ def test_settings_are_complete_and_say_which_command_makes_them():
     assert given().command() == " ".join(command)
 
 
-@pytest.mark.parametrize(("words", "folder", "work"), [
-    ((), "results/example/cartpole", "runs/experiments/example/cartpole"),
-    (["quick=true"], "runs/experiments/example-quick/cartpole", None),
-    (["out=results/example/mine"], "results/example/mine", "runs/experiments/example/mine"),
-    (["out=/tmp/mine", "work=/tmp/other"], "/tmp/mine", "/tmp/other"),
-])  # fmt: skip
-def test_results_are_apart_from_what_may_be_deleted(words, folder, work):
-    settings = given(*words)
-    assert str(settings.folder) == folder
-    assert str(settings.work_folder) == (work or f"{folder}/work")
-
-
 @pytest.mark.parametrize(
     ("word", "field"),
     [("agents=[dqn]", "agents"), ("agents=ddqn,ppo", "agents"), ("num_agents=0", "num_agents"),

@@ -229,19 +229,6 @@ def test_ends_are_drawn_with_their_probability():
     assert abs(share - probability) < 5 * (probability * (1 - probability) / count) ** 0.5
 
 
-@pytest.mark.parametrize(
-    ("max_steps", "d", "last"),
-    [(200, 0.0, (False, True, 1.0)), (1, 1.0, (True, True, 0.0))],  # the second as with TimeLimit
-)
-def test_an_episode_is_truncated_at_the_tasks_limit(max_steps, d, last):
-    env = env_of(world_of(max_steps=max_steps, outputs={"done": d}))
-    env.reset(seed=0)
-    steps = [env.step(1) for _ in range(max_steps)]
-    assert [(*step[2:4], step[4]["discount"]) for step in steps] == [(False, False, 1.0)] * (
-        max_steps - 1
-    ) + [last]
-
-
 @ALONE_AND_MANY
 @pytest.mark.parametrize(
     "outputs",

@@ -200,12 +200,6 @@ def test_a_walk_in_a_grid_world_is_that_in_jax(name):
         env.step(4)
 
 
-def test_a_grid_world_pays_another_reward_at_the_goal():
-    env = GridWorld("cliff_walking", goal_reward=-1.0)
-    env._index = 35
-    assert env.step(2) == (47, -1.0, True, False, {})
-
-
 def test_the_time_limit_is_the_tasks_and_there_once():
     env = gymnasium.make("sejax/mountain_car_continuous-rn")
     env.reset(seed=0)

@@ -27,6 +27,8 @@ class FakeHub:
       private: how repositories were made.
     """
 
+    __spec__ = True  # it is installed
+
     def __init__(self, folder):
         self.folder, self.commits, self.sizes, self.private = folder, {}, {}, {}
         self.HfApi = lambda: self

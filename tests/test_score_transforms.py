@@ -145,6 +145,11 @@ def test_rounding_of_the_incumbents_mean_is_no_advantage(name, score):
     np.testing.assert_array_equal(transform(name, [score, better, score], score), [0, 1, 0])
 
 
+def test_all_are_better_than_an_incumbent_without_a_score():
+    weights = transform("all_better_2", [-3e7, -3e7, NAN], NAN)  # also if 32 bits cannot subtract 1
+    np.testing.assert_array_equal(weights, [0.5, 0.5, 0])
+
+
 # --- of one's own --------------------------------------------------------------------------------
 
 

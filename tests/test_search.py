@@ -177,6 +177,28 @@ def test_the_trial_of_a_worker_that_lives_is_left_to_it(tmp_path, learning):
     assert states(current) == ["RUNNING", "COMPLETE"]
 
 
+def test_a_trial_that_ends_meanwhile_is_left_alone(tmp_path, learning, monkeypatch):
+    current, search = opened(tmp_path, "trials=2", *ONE)
+    theirs, get_trials = [current.ask()], current.get_trials
+
+    def snapshot(**_):
+        trials = get_trials()
+        if theirs:
+            current.tell(theirs.pop(), 1.0)
+        return trials
+
+    monkeypatch.setattr(current, "get_trials", snapshot)
+    study.work(current, search)
+    assert states(current) == ["COMPLETE"] * 2 and current.trials[0].value == 1.0
+
+
+def test_a_trial_that_fails_stops_no_other_worker(tmp_path, learning):
+    learning.meanwhile = lambda trial, _: 1 / (trial != "0000")
+    with pytest.raises(ZeroDivisionError):
+        worked(tmp_path, "trials=2", *ONE)
+    assert states(worked(tmp_path, "trials=2", *ONE)) == ["FAIL", "COMPLETE"]
+
+
 # --- the study -----------------------------------------------------------------------------------
 
 

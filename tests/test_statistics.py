@@ -25,8 +25,3 @@ def test_the_worst_tenth_is_the_mean_of_the_lowest_values():
     assert worst_tenth(np.random.default_rng(0).permutation(20)) == 0.5
     assert worst_tenth([3.0, 1.0, 2.0]) == 1.0 and worst_tenth(range(11)) == 0.5
     assert np.isnan(worst_tenth([np.nan, 1.0]))
-
-
-def test_equal_runs_have_no_uncertainty():
-    assert mean_interval([3.0] * 5) == (3.0, 3.0)
-    assert difference_interval([3.0] * 5, [1.0] * 6) == (2.0, 2.0)

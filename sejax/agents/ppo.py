@@ -61,6 +61,7 @@ class PPOConfig(AgentOptions):
     `env=mountain_car_continuous proxy=rn preset=paper`; see `docs/reference.md` 4.5.
 
     Attributes:
+      warmup_episodes: Episodes before a stop rule may judge; a full rollout is learned from.
       rollout_steps: Decisions between two learning phases; null: as `update_episodes` says.
       update_episodes: episodes of full length between two learning phases
       epochs: passes over the rollout in a learning phase

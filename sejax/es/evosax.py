@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
+from sejax.ops.scores import below_all
 from sejax.options import Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second
@@ -124,12 +125,9 @@ def from_evosax(
         key: Array, population: Array, scores: Array, incumbent_score: Array, state: StrategyState
     ) -> StrategyState:
         # An infinity would poison algorithms that standardise. So a score that is not finite
-        # becomes worse than the worst, by the gap between best and worst, and by 1 at least.
-        finite, fitness = jnp.isfinite(scores), -scores
-        worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
-        best = jnp.min(jnp.where(finite, fitness, jnp.inf))
-        others = jnp.where(finite.any(), worst + jnp.maximum(worst - best, 1.0), 0.0)
-        fitness = jnp.where(finite, fitness, others)
+        # becomes worse than the worst.
+        finite = jnp.isfinite(scores)
+        fitness = -jnp.where(finite, scores, finite.any() * below_all(scores))
         return algorithm.tell(key, population, fitness, state, params)[0]
 
     return Strategy(

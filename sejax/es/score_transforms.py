@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.ops.scores import is_tie, or_lowest_finite, or_minus_inf
+from sejax.ops.scores import below_all, is_tie, or_lowest_finite, or_minus_inf
 from sejax.options import ConfigError, registry, require, told
 
 FIELD = "es.score_transform"
@@ -136,9 +136,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     Every candidate with a finite score is better than an incumbent without one.
     """
-    finite = or_lowest_finite(scores)
-    below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
-    floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
+    floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all(scores))
     is_better = jnp.isfinite(scores) & ~(jnp.isfinite(incumbent) & is_tie(scores, incumbent))
     return jnp.where(is_better, jnp.maximum(scores - floor, 0.0), 0.0)
 

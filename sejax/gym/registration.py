@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
-from sejax.options import ConfigError, Count, checked, require
+from sejax.options import Count, checked, require, require_package
 from sejax.options.plain import configure
 from sejax.proxies.header import PRETRAINED_DIR, Header, pretrained_names, read
 
@@ -100,13 +100,11 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     Raises:
       ConfigError: as `make_vec`, or without Stable-Baselines3.
     """
-    try:
-        from stable_baselines3.common.vec_env import DummyVecEnv
+    require_package("make_sb3", "stable_baselines3", "sb3")
+    from stable_baselines3.common.vec_env import DummyVecEnv
 
-        from sejax.gym.sb3 import SyntheticVecEnv
-    except ImportError as error:
-        message = f"make_sb3 needs Stable-Baselines3; got {error}. Type pip install 'sejax[sb3]'."
-        raise ConfigError(message) from error
+    from sejax.gym.sb3 import SyntheticVecEnv
+
     _, world = _read(source, task)
     num_envs = checked([num_envs], Count, "num_envs", 8)
     if world is None:

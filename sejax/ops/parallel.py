@@ -16,7 +16,7 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
-from sejax.options import require
+from sejax.options import Count, checked, require
 
 T = TypeVar("T")
 
@@ -110,6 +110,8 @@ def spread_groups_over_devices(
     Returns:
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
+    for name, count in (("devices", num_devices), ("num_parallel", num_parallel)):
+        checked([count], Count, name, None)
     available = jax.devices()
     must = f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null."
     require(num_devices is None or num_devices <= len(available), "devices", must)

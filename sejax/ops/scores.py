@@ -38,6 +38,13 @@ def or_lowest_finite(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))
 
 
+def below_all(scores: Float[Array, "*n"]) -> Float[Array, ""]:
+    """A score below the finite ones, by their range and at least by what 32 bits can tell."""
+    scores = or_lowest_finite(scores)
+    lowest, gap = scores.min(), scores.max() - scores.min()
+    return lowest - jnp.maximum(gap, _TIE * jnp.maximum(1e6, jnp.abs(lowest)))
+
+
 def merged_moments(moments: Moments, others: Moments) -> Moments:
     """The moments of two groups of numbers together.
 

@@ -48,16 +48,6 @@ class Makes(Protocol[T_co]):
     def make(self) -> Callable[..., T_co]: ...
 
 
-@runtime_checkable
-class RunConfig(Protocol):
-    """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
-
-    @property
-    def generations(self) -> int: ...
-
-    def parts(self) -> dict[str, Any]: ...
-
-
 class Group(NamedTuple):
     """A kind of plugin.
 

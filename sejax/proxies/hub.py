@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from sejax.options import ConfigError, require, shortened, told
+from sejax.options import ConfigError, require, require_package, shortened, told
 
 SCHEME = "hf://"
 FILE = "proxy.safetensors"
@@ -72,14 +72,13 @@ def fetch(address: str, option: str = "source") -> Path:
 @contextlib.contextmanager
 def explained(option: str, address: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
+    require_package(option, "huggingface_hub", "hub")
     try:
         yield
     except ConfigError:
         raise
     except Exception as error:  # the HTTP library's too, which depends on huggingface_hub's version
-        is_missing = isinstance(error, ImportError)
         fix = "Check the name and the network, or log in: hf auth login"
-        fix = "Install it with pip install 'sejax[hub]'" if is_missing else fix
         got = f"got {shortened(address, 60)}: {shortened(told(error), 90)}"
         message = f"{option} must be within reach on the Hub; {got}. {fix}."
         raise ConfigError(message, option) from error

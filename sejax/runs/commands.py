@@ -70,11 +70,13 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 def _devices(overrides: Sequence[str]) -> int | None:
     """The largest number of `devices=`; 1 if other machines compute the trainings."""
     with contextlib.suppress(ConfigError):  # the command raises it later
+        known = ("devices", "machines", "machines.name", "preset")  # which may tell
+        overrides = [word for word in overrides if word.partition("=")[0] in known]
         trees = [compose.read(words, ["machines"]) for words in compose.expand(overrides)]
         here = [tree.get("machines", {}).get("name", "local") == "local" for tree in trees]
         counts = [str(x.get("devices", "")) if y else "1" for x, y in zip(trees, here, strict=True)]
-        are_counts = all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts)
-        return max(map(int, counts)) if are_counts else None
+        if all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts):
+            return max(map(int, counts))
     return None
 
 

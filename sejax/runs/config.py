@@ -161,12 +161,13 @@ class CommandConfig(Options):
         field = f"{group}.solved_by"
         message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
         require(training.stop_rule != "solved" or got == "test", field, message)
-        before = self.agents[key].steps_before_learning(longest, spec.max_steps)
-        steps = training.max_steps
-        must = f"must exceed {before}, before which {shortened(key)} learns nothing; got {steps}."
-        is_enough = not proxy.reaches_step_limit or steps is None or steps > before
-        field = f"{group}.max_steps"
-        require(is_enough, field, f"{must} Set {field}={4 * before}.")
+        # The shortest episodes: of other proxies they may have one step.
+        shortest = longest if proxy.reaches_step_limit else 1
+        before = self.agents[key].steps_before_learning(shortest, spec.max_steps)
+        for name, num_steps in (("max_steps", 1), ("max_episodes", longest)):
+            limit, least, field = getattr(training, name), before // num_steps, f"{group}.{name}"
+            must = f"must exceed {least}, before which {shortened(key)} learns nothing; got {limit}"
+            require(limit is None or limit > least, field, f"{must}. Set {field}={4 * least}.")
 
 
 @dataclass(frozen=True, kw_only=True)

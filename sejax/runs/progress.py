@@ -3,6 +3,8 @@
 import shlex
 import time
 
+import numpy as np
+
 from sejax.bilevel import Bilevel
 from sejax.options import registry
 from sejax.options.plain import to_plain
@@ -57,11 +59,10 @@ class RunProgress:
     def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how the run ended, where its files are, and what to do next."""
         path, solved_score = directory.folder, bilevel.solved_score
-        is_solved = solved_score is not None and best >= solved_score
+        is_solved = solved_score is not None and np.float32(best) >= np.float32(solved_score)
         verdict = f"best search mean {best:.1f}"
         if solved_score is not None:
-            is_not = "" if is_solved else "not "
-            verdict = f"{is_not}solved: {verdict}, solved at {solved_score:g}"
+            verdict = f"{'' if is_solved else 'not '}solved: {verdict}, solved at {solved_score:g}"
         elif bilevel.scoring.objective.meaning:
             verdict += f": {bilevel.scoring.objective.meaning}"
         # The user must type the names of plugins: no name in a file is imported.

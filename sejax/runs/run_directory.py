@@ -7,7 +7,7 @@ refused changes nothing.
 
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import Self, TypeVar
+from typing import Self, TypeVar, cast
 
 import jax
 import numpy as np
@@ -225,13 +225,11 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
         stored, expected = there.get(name, "missing"), here.get(name, "missing")
         if stored != expected:
             raise ValueError(f"{name} is {stored}, and {expected} in this version")
-    arrays = {name: jax.numpy.array(tensors[name]) for name in leaves}
-    restored = [
-        jax.random.wrap_key_data(arrays[name]) if _is_key(leaf) else arrays[name]
-        for name, leaf in leaves.items()
-    ]
-    state: State = jax.tree.unflatten(jax.tree.structure(like), restored)
-    return state
+    restored = []
+    for name, leaf in leaves.items():
+        array = jax.numpy.array(tensors[name])
+        restored.append(jax.random.wrap_key_data(array) if _is_key(leaf) else array)
+    return cast(State, jax.tree.unflatten(jax.tree.structure(like), restored))
 
 
 def _named(tree: PyTree) -> dict[str, Array]:

@@ -46,8 +46,9 @@ def open_study(search: StudyPlan) -> optuna.Study:
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     folder = search.folder
+    with contextlib.suppress(OSError, ValueError):  # what the next line raises
+        (folder / "trials").mkdir(parents=True, exist_ok=True)
     require_writable("search_dir", folder)
-    (folder / "trials").mkdir(parents=True, exist_ok=True)
     store = Store(folder, search.settings(), field="search_dir", free=FREE)
     budgets = search.config.min_generations, search.config.max_generations
     # An address would end at a question mark in the folder's name.
@@ -144,7 +145,12 @@ def work(study: optuna.Study, search: StudyPlan) -> None:
                 trial = _claimed(study, search, held)
             if trial is None:
                 return
-            print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
+            try:
+                print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
+            except Exception as error:
+                if not isinstance(error, (ConfigError, OSError, *UNUSABLE)):  # the user mends these
+                    study.tell(trial, state=TrialState.FAIL)  # else every worker would die of it
+                raise
 
 
 def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack) -> Trial | None:
@@ -157,6 +163,9 @@ def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack)
         try:
             held.enter_context(_lock(search, _name(frozen.number), timeout=0))
         except filelock.Timeout:  # its worker is alive
+            continue
+        if study.get_trials(deepcopy=False)[frozen.number].state != TrialState.RUNNING:
+            held.close()  # its worker has ended it meanwhile
             continue
         trial = Trial(study, frozen._trial_id)
         for name, distribution in space.items():  # the trial may lack some parameters
