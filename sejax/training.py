@@ -245,7 +245,24 @@ def num_parallel_on_cpu(
 
 
 class _Loop:
-    """The step loop of one agent in one world; pure functions of its carry."""
+    """The step loop of one agent in one world; pure functions of its carry.
+
+    `train` runs `step` while `state.active`. An agent that learns from whole rollouts runs
+    `rollout` in its place: `learns_every` steps that do not learn, then one update.
+
+    ============ ===========================================================================
+    carried      how it changes
+    ============ ===========================================================================
+    `large`      replay buffer and learning curve: rows are written in place, never selected
+    `state`      all else, a `_LoopState`: small enough to be selected
+    ============ ===========================================================================
+
+    `step` ends a training at `max_steps`; `end_episode` ends it at `max_episodes`, by the stop
+    rule, or after a number that is not finite. Under `vmap` (`masked`) a training that is over
+    computes steps until the last one of its batch is over. Then `active` is False: its writes to
+    `large` go beyond the last row, where they are dropped, and `while_any_active` (in a rollout
+    `rollout` itself) keeps its `state` by a select.
+    """
 
     def __init__(
         self,

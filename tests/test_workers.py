@@ -23,7 +23,7 @@ def require_equal_numbers(words, generations):
 
     def compute(shares):
         sizes.extend(len(trainings.active) for _, trainings in shares)
-        return [ray.score(setup, share) for share in reversed(shares)][::-1]
+        return [ray.outcomes_of(setup, share) for share in reversed(shares)][::-1]
 
     remote = RemoteChunks(config, compute)
     local = Chunks(remote.bilevel)
@@ -76,13 +76,13 @@ def make_room():
 
 def test_a_worker_imports_the_plugins_that_were_typed():
     config = sejax.config(["env=test_workers:make_room", *SOLVING[1:]])
-    assert len(ray._programs(json.dumps(config.plain()))) == 1
+    assert len(ray._share_programs(json.dumps(config.plain()))) == 1
 
 
 def test_a_worker_with_other_versions_is_refused(monkeypatch):
     versions = runtime.versions()
     monkeypatch.setattr(runtime, "versions", lambda: {"jax": "0.1"})
-    error = refusal(ray.call, versions, ray.score, (0, ()))
+    error = refusal(ray.call, versions, ray.outcomes_of, (0, ()))
     assert error.field == "machines" and "0.1" in str(error)
 
 

@@ -252,7 +252,7 @@ class PPO(Learner):
         rollout, return_moments = self.prepared(state, steps, batch.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, rollout.returns.size)
 
-        def adam_step(number: Array, carry: Moved) -> Moved:
+        def minibatch_step(number: Array, carry: Moved) -> Moved:
             params, opt_state = carry
             minibatch = rollout
             if config.num_minibatches > 1:
@@ -264,7 +264,7 @@ class PPO(Learner):
 
         num_updates = config.epochs * config.num_minibatches
         params, opt_state = jax.lax.fori_loop(
-            0, num_updates, adam_step, (state.params, state.opt_state)
+            0, num_updates, minibatch_step, (state.params, state.opt_state)
         )
         return state.replace(params=params, opt_state=opt_state, return_moments=return_moments)
 

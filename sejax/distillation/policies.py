@@ -30,7 +30,7 @@ from sejax.distillation.policy_search import Arrays, Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import ConfigError, Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import configure
-from sejax.proxies.exact import Layer, evaluate, require_vectors
+from sejax.proxies.exact import Layer, forward, require_vectors
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig, make_trainer
 
@@ -199,7 +199,7 @@ def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.ze
     """
 
     def act(obs: np.ndarray) -> np.ndarray:
-        outputs = evaluate(layers, obs) + error(obs)
+        outputs = forward(layers, obs) + error(obs)
         if task.num_actions is not None:
             return outputs.argmax(axis=1)
         return outputs.clip(-task.max_action, task.max_action)
@@ -224,7 +224,7 @@ def erring(
     mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
     unit = task.max_action
     if task.num_actions is not None:
-        unit = float(evaluate(layers, states).std()) + 1e-9
+        unit = float(forward(layers, states).std()) + 1e-9
     maps = np.asarray(random_map(key, (episodes, task.action_dim, task.obs_dim + 1)))
 
     def error(obs: np.ndarray) -> np.ndarray:
@@ -296,7 +296,7 @@ def fit(
 
     def loss(params: PyTree, key: Array) -> Array:
         rows = jax.random.randint(key, (_BATCH_SIZE,), 0, len(inputs))
-        outputs, wanted = evaluate(params, inputs[rows]), targets[rows]
+        outputs, wanted = forward(params, inputs[rows]), targets[rows]
         if is_discrete:
             return optax.softmax_cross_entropy_with_integer_labels(outputs, wanted).mean()
         clipped = jnp.clip(outputs, -1.0, 1.0)

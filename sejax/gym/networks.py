@@ -39,7 +39,7 @@ def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def layers_of(weights: Mapping[str, np.ndarray], network: str) -> Layers:
+def network_layers(weights: Mapping[str, np.ndarray], network: str) -> Layers:
     """A network's layers, empty if the network is missing; files hold kernels as `[out, in]`."""
     names = (f"{network}/Dense_{i}" for i in itertools.count())
     there = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)

@@ -78,7 +78,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             shapes = {"info_weights": (num_keys,)}
         check_tensors("weights", weights, shapes, "those of the environment's task")
         self._weights = weights.get("info_weights")  # [info_keys]
-        self._layers = networks.layers_of(weights, "potential")
+        self._layers = networks.network_layers(weights, "potential")
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
         if isinstance(env.observation_space, Discrete) and self._layers and not keys:
             self._table = self._apply(np.eye(num_inputs)).tolist()

@@ -62,8 +62,8 @@ class SyntheticWorld:
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
         units = config.networks(self.obs_dim, action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
-        self._start_layers = networks.layers_of(weights, "start")
-        heads = [networks.layers_of(weights, name) for name in units if name != "start"]
+        self._start_layers = networks.network_layers(weights, "start")
+        heads = [networks.network_layers(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
         must = "must draw initial states; got None. Set RealTask(starts=...)."
         require(self.draws_noise or task.starts, "task.starts", must)

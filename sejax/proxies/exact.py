@@ -112,7 +112,7 @@ def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
     An action that is better by the margin m, or more, costs 1. Only a tenth of the differences in
     the given states are smaller than m, so that nearly every better action costs the same.
     """
-    outputs = evaluate(layers, states)
+    outputs = forward(layers, states)
     size = outputs.shape[1]
     better, chosen = np.nonzero(~np.eye(size, dtype=bool))  # [pair], both
     differences = np.abs(outputs[:, better] - outputs[:, chosen])
@@ -164,7 +164,7 @@ def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     return weights
 
 
-def evaluate(layers: Sequence[Layer], inputs: Vector) -> Vector:
+def forward(layers: Sequence[Layer], inputs: Vector) -> Vector:
     """The policy's outputs `[state, action_dim]` for states `[state, obs_dim]`, before clipping.
 
     Arrays are of NumPy or JAX.

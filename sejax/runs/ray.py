@@ -71,7 +71,9 @@ class RayConfig(Options):
         parts = config.plain().items()
         setup = json.dumps({name: x for name, x in parts if name not in ("tracker", "machines")})
         with self.pool() as pool:
-            yield RemoteChunks(config, lambda shares: pool(score, [(setup, x) for x in shares]))
+            yield RemoteChunks(
+                config, lambda shares: pool(outcomes_of, [(setup, x) for x in shares])
+            )
 
     @contextlib.contextmanager
     def pool(self) -> Iterator[Pool]:
@@ -120,7 +122,7 @@ class RemoteChunks(Chunks):
 
     Args:
       config: the run's configuration.
-      compute: returns `score` of each share, in the order of the shares.
+      compute: returns `outcomes_of` each share, in the order of the shares.
 
     Attributes:
       cpu_s: CPU seconds that the workers spent on trainings.
@@ -242,10 +244,10 @@ def _on_cluster(
 # --- a worker -------------------------------------------------------------------------------------
 
 
-def score(setup: str, share: WorkShare) -> tuple[Outcome, float]:
+def outcomes_of(setup: str, share: WorkShare) -> tuple[Outcome, float]:
     """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
     (agent_index, trainings), started = share, time.process_time()
-    size, program = _programs(setup)[agent_index]
+    size, program = _share_programs(setup)[agent_index]
     # Copies fill the share up; nothing is computed for them.
     n, numbers = len(trainings.active), np.arange(size)
     trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
@@ -255,7 +257,7 @@ def score(setup: str, share: WorkShare) -> tuple[Outcome, float]:
 
 
 @functools.lru_cache(maxsize=1)
-def _programs(setup: str) -> list[tuple[int, Any]]:
+def _share_programs(setup: str) -> list[tuple[int, Any]]:
     """For each agent of a run: the size of a share, and the program that computes a share."""
     # Whoever started the run has typed the names of its plugins, so all may be imported.
     config = configuration.learn_config(json.loads(setup), imports=None)
