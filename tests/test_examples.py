@@ -91,6 +91,7 @@ def test_it_runs(name, examples, monkeypatch, capsys):
     assert re.search(PRINTS[name], capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_a_command_takes_parts_from_its_folder_and_a_file_imports_none(examples, tmp_path):
     """What the command stores names them; it loads if task and proxy are given."""
     for name in ("own_task", "own_agent", "own_proxy", "own_objective"):
