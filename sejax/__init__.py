@@ -11,5 +11,5 @@ no environment variable and touches no flag.
 
 import lazy_loader
 
-__version__ = "1.0.0"
+__version__ = "1.1.0.dev0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

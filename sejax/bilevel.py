@@ -193,7 +193,7 @@ def make_learner(
       (2,)
     """
     if config is not None:
-        if not hasattr(config, "parts") or parts:
+        if not callable(getattr(config, "parts", None)) or parts:
             raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
     generations = checked([generations], Count, "generations", 100)

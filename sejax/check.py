@@ -60,7 +60,6 @@ FREE = {"devices", "machines", "out_dir", "num_agents"}  # may change when a com
 MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
 SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
-Trainings: TypeAlias = dict[str, TrainingConfig]  # by agent
 Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
 
 
@@ -136,14 +135,16 @@ def run(config: CheckConfig) -> dict[str, Any]:
     others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
     myopic = dict[str, dict[str, AgentConfig]]()
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
-    students = learned | others | {tuned: _tuned(task)}
+    students = learned | others
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
         sighted = {
             f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
         }
         myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
-    config = dataclasses.replace(config, agents=students)
-    on_proxy, on_task = (x._replace(is_varied=False) for x in setup_of(config)[0].values())
+    worlds = setup_of(dataclasses.replace(config, agents=students))[0].values()
+    on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
+    on_task.trainings[tuned] = config.real_training
+    config = dataclasses.replace(config, agents=students | {tuned: _tuned(task)})
     name = as_file_name(config.proxy.removesuffix(".safetensors"))
     folder = Path(config.out_dir or f"runs/check-{name}")
     settings = config.plain() | {"task": task.origin, "discount": proxy.discount}
@@ -156,14 +157,12 @@ def run(config: CheckConfig) -> dict[str, Any]:
         table, null = _trained(config, rows, store, pool), dict[str, Any]()
         rows, known = {}, [*learned, *others]
         if not proxy.env.is_real and task.num_states is None:
-            steps, trainings = table.groupby("agent")["train_steps"].mean(), on_proxy.trainings
-            lengths = {key: trainings[key].max_steps or ceil(steps[key]) for key in known}
-            world, null = _null(config, task, _of_lengths(trainings, lengths), store)
-            rows[NULL] = world, known
+            steps = table.groupby("agent")["train_steps"].mean()
+            world, null = _null(config, task, on_proxy.trainings, store)
+            rows[NULL] = _of_lengths(world, {key: ceil(steps[key]) for key in known}), known
         rows[TASK] = on_task, [*learned][: None if proxy.env.is_real else 1]
         rows[TUNED] = on_task, [tuned]
-        untrained = _of_lengths(on_task.trainings, dict.fromkeys(learned, 1))
-        rows[NOTHING] = on_task._replace(trainings=untrained), [*learned][:1]
+        rows[NOTHING] = _of_lengths(on_task, dict.fromkeys(learned, 1)), [*learned][:1]
         table = pd.concat([table, _trained(config, rows, store, pool)], ignore_index=True)
         return _reported(proxy, null, [*learned], table, folder)
 
@@ -182,18 +181,19 @@ def _tuned(task: Task) -> AgentConfig:
     return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)
 
 
-def _of_lengths(trainings: Trainings, num_steps: Mapping[str, int]) -> Trainings:
-    """Trainings of as many steps, by agent, with the tests of the given ones."""
-    return {
-        key: TrainingConfig(max_steps=x, max_episodes=x, test_episodes=trainings[key].test_episodes)
-        for key, x in num_steps.items()
-    }
+def _of_lengths(world: World, lengths: Mapping[str, int]) -> World:
+    """The world with trainings of as many steps, by agent, and with the tests of its own."""
+    trainings = {}
+    for key, steps in lengths.items():
+        tests = world.trainings[key].test_episodes
+        trainings[key] = TrainingConfig(max_steps=steps, max_episodes=steps, test_episodes=tests)
+    return world._replace(trainings=trainings)
 
 
 def _null(
-    config: CheckConfig, task: Task, trainings: Trainings, store: Store
+    config: CheckConfig, task: Task, trainings: dict[str, TrainingConfig], store: Store
 ) -> tuple[World, dict[str, Any]]:
-    """A one-step SE made of a cheap policy; agents train on it as long as on the proxy.
+    """A one-step SE made of a cheap policy.
 
     A random search finds the policy. If it does not solve the task, a PPO is trained too, and the
     better policy is taken.

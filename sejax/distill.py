@@ -125,8 +125,7 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         raise ConfigError(f"{shortened(name, 40)} {message}", name)
     words = [f"{name}={text}" for name, text in texts.items()]
     config = configuration.config(words, StudentsConfig)
-    is_default, must = config.agent_hparams == "default", "must be default, as students have"
-    require(is_default, "agent_hparams", f"{must} fixed ones; got varied. Leave it out.")
+    require(config.agent_hparams == "default", "agent_hparams", "has no effect here. Leave it out.")
     # The task's reward for being healthy is left out of searches.
     bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
     return from_plain(DistillConfig, merge(bonus, values), ""), config

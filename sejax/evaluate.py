@@ -243,7 +243,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
         if config.training_from == "config":
             group, training = "training", config.training
         elif proxy is not None and not proxy.env.is_real:  # RNs: as on the real task
-            training = _as_learned(proxy, config, agent)
+            group, training = "training", _as_learned(proxy, config, agent)
         if proxy is not None:
             config.require_learning(key, group, training, proxy.env.config, task)
         trainings[key] = training

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, sizes_of
 from sejax.agents.buffers import no_buffer
+from sejax.agents.varied import for_keys
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.wrappers import repeat_actions
@@ -253,11 +254,7 @@ def make_evaluator(
         train = make_tested_trainer(agent, env, task, training, in_batches=False)
 
         def run(
-            key: Array,
-            env_params: PyTree,
-            active: Array | bool,
-            test_params: PyTree,
-            hparams: Hparams,
+            key: Array, env_params: PyTree, active: Array, test_params: PyTree, hparams: Hparams
         ) -> Outcome:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
@@ -350,12 +347,13 @@ def evaluate_agents(
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
     `sejax.load` returns `env, env_params`; `task` is the real task. Calls with equal arguments
-    share a compiled program; `env_params` and values of `keys` may differ. Results equal those of
+    share a compiled program; `env_params` and values of `keys` may differ, but that keys of varied
+    agents must draw networks of the same sizes. Results equal those of
     `jax.vmap(make_evaluator(...))` up to rounding: programs of another width add in another order,
     and a training amplifies a difference in the last bit.
     """
     env = env.bare if isinstance(env, ProxyEnv) else env
-    program = _evaluation_program(agent, env, task, training, num_parallel, devices)
+    program = _evaluation_program(for_keys(agent, keys), env, task, training, num_parallel, devices)
     return program(keys, env_params)
 
 

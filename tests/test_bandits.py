@@ -97,11 +97,3 @@ def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
     """Two of twenty, though nineteen have the return of the tenth quantile."""
     row = summary("by_hand", "hand-00", [100] + [200] * 19, policy_return=200.0)
     assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100
-
-
-@pytest.mark.parametrize("env", null_baselines.TEACHERS)
-def test_teachers_have_most_of_their_steps_to_learn(env):
-    """Agents made for one-step SEs explore for a hundred episodes, which are whole on a task."""
-    task = envs.make(env)
-    for kind, steps in null_baselines.TEACHERS[env].items():
-        assert agents.tuned_agent(env, kind).warmup_episodes * task.max_steps < 0.7 * steps

@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from support import is_drawn, refuse, refused
+from support import is_drawn, refusal, refuse, refused
 
 import sejax
 from sejax.myopia import Judgement, judge, verdict_of
@@ -89,6 +89,7 @@ def test_a_policy_that_is_written_down_is_a_stored_policy(tmp_path, capsys):
     assert found["worlds"]["the proxy"]["test_return_mean"] > 195
     assert found["null_se"]["return"] >= 195 and found["null_se"]["real_steps"] < 200_000
     assert found["worlds"]["the null SE"]["test_return_mean"] > 150 and not found["cost"]
+    assert len({found["worlds"][x]["train_steps_mean"] for x in ("the null SE", "the proxy")}) == 1
     assert "verdict: a stored policy\n" in capsys.readouterr().out
 
 
@@ -129,8 +130,9 @@ def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     assert refused(run, path, out_dir=tmp_path / "other", seed=1) == "out_dir"
     proxy = sejax.load_proxy(path)  # the same weights, but of another SE
     env = dataclasses.replace(proxy.env.config, min_steps=3).make(proxy.task)
-    sejax.save(path := tmp_path / "mine.safetensors", env, proxy.params.weights, proxy.config)
-    assert refused(run, path, out_dir=tmp_path / "other") == "out_dir"
+    how = proxy.params.weights, proxy.config, proxy.discount
+    sejax.save(path := tmp_path / "mine.safetensors", env, *how)
+    assert "proxy.min_steps (1" in str(refusal(run, path, out_dir=tmp_path / "other"))
 
 
 def test_a_reward_network_is_judged_by_training_steps(tmp_path):

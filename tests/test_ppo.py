@@ -156,8 +156,8 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
     assert config.rollout_length(max_steps) == decisions
     given = dataclasses.replace(config, rollout_steps=17)
     assert given.rollout_length(max_steps) == 17
-    assert given.steps_before_learning(1, max_steps) == 17 * action_repeat
-    assert config.steps_before_learning(1, max_steps) == decisions * action_repeat
+    assert given.steps_before_learning(9, max_steps) == 17 * action_repeat
+    assert given.steps_before_learning(1, max_steps) == 17  # a decision is one step
 
 
 def test_a_minibatch_has_at_least_two_steps():

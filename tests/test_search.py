@@ -179,24 +179,23 @@ def test_the_trial_of_a_worker_that_lives_is_left_to_it(tmp_path, learning):
 
 def test_a_trial_that_ends_meanwhile_is_left_alone(tmp_path, learning, monkeypatch):
     current, search = opened(tmp_path, "trials=2", *ONE)
-    theirs, get_trials = [current.ask()], current.get_trials
-
-    def snapshot(**_):
-        trials = get_trials()
-        if theirs:
-            current.tell(theirs.pop(), 1.0)
-        return trials
-
-    monkeypatch.setattr(current, "get_trials", snapshot)
+    theirs, get_trials = current.ask(), current.get_trials
+    ends = [lambda: current.tell(theirs, 1.0)]
+    before = lambda **_: (get_trials(), ends and ends.pop()())[0]  # noqa: E731
+    monkeypatch.setattr(current, "get_trials", before)
     study.work(current, search)
     assert states(current) == ["COMPLETE"] * 2 and current.trials[0].value == 1.0
 
 
-def test_a_trial_that_fails_stops_no_other_worker(tmp_path, learning):
+@pytest.mark.parametrize(("place", "state"), [("", "FAIL"), ("my.py:3: f()", "COMPLETE")])
+def test_a_trial_that_fails_stops_no_other_worker(tmp_path, learning, monkeypatch, place, state):
+    """One that fails in the user's own code is resumed when the code is mended."""
+    monkeypatch.setattr(study, "place_of", lambda error: place)
     learning.meanwhile = lambda trial, _: 1 / (trial != "0000")
     with pytest.raises(ZeroDivisionError):
         worked(tmp_path, "trials=2", *ONE)
-    assert states(worked(tmp_path, "trials=2", *ONE)) == ["FAIL", "COMPLETE"]
+    learning.meanwhile = lambda *_: None
+    assert states(worked(tmp_path, "trials=2", *ONE)) == [state, "COMPLETE"]
 
 
 # --- the study -----------------------------------------------------------------------------------

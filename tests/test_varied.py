@@ -16,7 +16,7 @@ from sejax.agents.buffers import Transition, block_size, num_columns, sum_over_b
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
+from sejax.agents.varied import Range, draw_value, for_keys, hidden_sizes, ranges_of
 from sejax.ops.networks import MLP, narrow
 from sejax.options import option
 
@@ -236,3 +236,6 @@ def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key()
     variant = dataclasses.replace(variant, hparams=hparams)
     alone = jax.jit(sejax.make_evaluator(variant, task.env, task, training))
     assert_close(train(key, task.params), alone(key, task.params), rtol=1e-4, atol=1e-5)
+    few = for_keys(varied, key[None]).varied  # which compiles this variant alone
+    assert few.agents == (varied.varied.agents[int(number)],)
+    assert few.draw(drawing_key(key)) == (0, hparams, values)

@@ -19,6 +19,7 @@ import sejax
 from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
 from sejax.agents import NoExploration
+from sejax.agents.varied import for_keys
 from sejax.ops.parallel import spread_over_devices
 from sejax.options.plain import configure, to_plain
 from sejax.training import num_parallel_on_cpu
@@ -162,13 +163,17 @@ def train(
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
     task, varied = condition.task, condition.hparams == "varied"
     agent = sejax.make_agent(condition.agent, task, condition.exploration, varied)
-    env, training = condition.env, condition.training
-    program = make_program(measure, agent, env, task, training, settings.devices)
     padded = [*places, *[places[-1]] * (at_once - len(places))]
     key = jax.random.key(settings.seed)
-    own_keys = [key if condition.is_single else jax.random.fold_in(key, i) for i in padded]
-    # Of a group's agents, the first ones have the same keys for any number of them.
-    keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
+
+    def keys_of(places: Iterable[int]) -> jax.Array:
+        keys = [key if condition.is_single else jax.random.fold_in(key, i) for i in places]
+        # Of a group's agents, the first ones have the same keys for any number of them.
+        return jax.numpy.concatenate([jax.random.split(key, num_agents) for key in keys])
+
+    agent = for_keys(agent, keys_of(range(len(condition.groups))))  # one program for all groups
+    env, training, keys = condition.env, condition.training, keys_of(padded)
+    program = make_program(measure, agent, env, task, training, settings.devices)
     each = [condition.groups[i].params for i in padded]
     params = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
     active = np.repeat(np.arange(at_once) < len(places), num_agents)

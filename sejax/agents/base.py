@@ -179,7 +179,7 @@ class AgentConfig(Options):
         """Training steps before the agent first learns.
 
         Args:
-          max_episode_steps: step limit of training episodes, all of which may last that long.
+          max_episode_steps: steps of each training episode.
           task_max_steps: step limit of the task that the agent was made for.
         """
         return 0

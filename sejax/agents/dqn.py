@@ -7,7 +7,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, cast
 
 import jax
 import jax.numpy as jnp
@@ -151,8 +151,7 @@ class DDQN(OffPolicy):
         return state.replace(epsilon=epsilon)
 
     def q_values(self, params: PyTree, obs: Array) -> Float[Array, "actions *batch"]:
-        values: Any = self.network.apply(params, obs)
-        return values
+        return cast(Array, self.network.apply(params, obs))
 
     def act(self, key: Array, state: DDQNState, obs: Array, explore: bool) -> Array:
         q_values = self.q_values(state.params, obs)

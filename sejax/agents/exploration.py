@@ -12,7 +12,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -206,8 +206,7 @@ class Curious:
 
     def outputs(self, params: PyTree, batch: Transition) -> ICMOutputs:
         action = as_vectors(batch.action, self.model.action_width)
-        outputs: Any = self.model.apply(params, batch.obs, action, batch.next_obs)
-        return outputs
+        return cast(ICMOutputs, self.model.apply(params, batch.obs, action, batch.next_obs))
 
     def train(self, state: CuriousState, batch: Transition) -> CuriousState:
         """One step of Adam."""

@@ -117,7 +117,7 @@ class PPOConfig(AgentOptions):
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         """PPO learns once a rollout is full; the task's limit decides its length."""
-        return self.rollout_length(task_max_steps) * self.action_repeat
+        return self.rollout_length(task_max_steps) * min(self.action_repeat, max_episode_steps)
 
     def spec(self) -> AgentSpec:
         # It learns from the start; `warmup_episodes` only holds back the stop rule.

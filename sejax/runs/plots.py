@@ -10,14 +10,14 @@ from matplotlib.figure import Figure
 
 from sejax.ops.files import atomic_path
 
-INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
+INCUMBENT, POPULATION, SOLVED = "#1f5fa8", "#d9822b", "#3c8d40"
 STYLE: dict[Any, Any] = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def learning_curve(
     rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path, title: str
 ) -> None:
-    """Draws `learning_curve.png`: scores above, agents' training steps below where they vary.
+    """Draws `learning_curve.png`.
 
     Args:
       rows: rows of `metrics.csv`, as text or numbers.
@@ -28,33 +28,24 @@ def learning_curve(
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
     agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
-    steps = {name: y for name, y in data.items() if name.startswith("train_steps_mean")}
-    lines = 1 + any(map(np.ptp, steps.values()))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7, 2.5 + 1.5 * lines))
-        figure.subplots(lines, sharex=True, height_ratios=(2, 1)[:lines])
-        top, bottom = figure.axes[0], figure.axes[-1]
+        figure = Figure(figsize=(7, 4))
+        axis = figure.subplots()
         label = "search mean: mean and std over fresh agents"
-        top.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
-        top.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
-        top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
-        top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
+        axis.plot(x, mean, color=INCUMBENT, lw=2, marker="o", ms=4, label=label)
+        axis.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
+        axis.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
+        axis.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
         for i, agent in enumerate(agents):
             style: dict[str, Any] = {"color": f"C{i}", "lw": 1.3, "ls": "-."}
-            top.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
-            if lines > 1:
-                bottom.plot(x, steps[f"train_steps_mean_{agent}"], **style)
+            axis.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
-            top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
-        top.set_ylabel("score" if solved_score is None else "return on the real task")
-        top.set_title(title)
-        top.legend(frameon=False, fontsize=9, loc="best")
-        bottom.set_xlabel("generation")
-        if lines > 1:
-            bottom.plot(x, steps["train_steps_mean"], color=STEPS, lw=1.8)
-            bottom.set(ylabel="training steps\nof an agent", ylim=(0, None))
-        bottom.locator_params(axis="x", integer=True)
+            axis.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
+        unit = "score" if solved_score is None else "return on the real task"
+        axis.set(xlabel="generation", ylabel=unit, title=title)
+        axis.legend(frameon=False, fontsize=9, loc="best")
+        axis.locator_params(axis="x", integer=True)
         _write(figure, path)
 
 

@@ -266,10 +266,9 @@ def _share_programs(setup: str) -> list[tuple[int, Any]]:
     def program_of(agent_index: int, size: int) -> Any:
         spread = spread_over_devices(bilevel.evaluate.evaluators[agent_index], 1, size)
 
-        def evaluate(sent: Trainings) -> Outcome:
+        def evaluate(sent: Trainings) -> Any:
             key = jax.random.wrap_key_data(sent.key)
-            outcome: Outcome = spread(dataclasses.replace(sent, key=key))
-            return outcome
+            return spread(dataclasses.replace(sent, key=key))
 
         return jax.jit(evaluate, compiler_options=compiler_options())
 

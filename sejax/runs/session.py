@@ -52,7 +52,7 @@ def run(
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
-    drawn = time.monotonic()
+    drawn, summary_file = time.monotonic(), directory.folder / "run.json"
     folder, first = directory.folder.resolve(), len(directory.rows)
     run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
     guarded = GuardedTracker(config.tracker, run, report.say)
@@ -61,6 +61,7 @@ def run(
             first = len(directory.rows)
             if first >= config.generations:
                 break
+            summary_file.unlink(missing_ok=True)  # it would tell of fewer generations
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
@@ -87,7 +88,6 @@ def run(
         "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
         "real_steps": int(directory.last("env_steps_total")),
     }
-    summary_file = directory.folder / "run.json"
     with contextlib.suppress(OSError, ValueError, TypeError):  # none, or damaged
         stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
         if stored | counts == stored:

@@ -23,12 +23,13 @@ from optuna.trial import Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from sejax.ops.files import require_writable, write_text
-from sejax.options import ConfigError, told
+from sejax.options import ConfigError, place_of, told
 from sejax.options.plain import parsed
 from sejax.runs import session
 from sejax.runs.chunks import make_chunks
 from sejax.runs.config import LearnConfig, layers_of
 from sejax.runs.run_directory import RunDirectory
+from sejax.runs.runtime import platform_error
 from sejax.runs.store import Store
 from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
 
@@ -48,7 +49,7 @@ def open_study(search: StudyPlan) -> optuna.Study:
     folder = search.folder
     with contextlib.suppress(OSError, ValueError):  # what the next line raises
         (folder / "trials").mkdir(parents=True, exist_ok=True)
-    require_writable("search_dir", folder)
+    require_writable("search_dir", folder / "trials")
     store = Store(folder, search.settings(), field="search_dir", free=FREE)
     budgets = search.config.min_generations, search.config.max_generations
     # An address would end at a question mark in the folder's name.
@@ -148,7 +149,8 @@ def work(study: optuna.Study, search: StudyPlan) -> None:
             try:
                 print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
             except Exception as error:
-                if not isinstance(error, (ConfigError, OSError, *UNUSABLE)):  # the user mends these
+                mended = (ConfigError, OSError, *UNUSABLE)  # by the user, as own code is
+                if not (isinstance(error, mended) or place_of(error) or platform_error()):
                     study.tell(trial, state=TrialState.FAIL)  # else every worker would die of it
                 raise
 
