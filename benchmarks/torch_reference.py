@@ -390,7 +390,10 @@ class DDQNAgent:
 
 
 def epsilon_at(episode: int, hp: DDQNConfig) -> float:
-    """Epsilon's initial value, decayed by a factor for each episode down to its minimum."""
+    """Epsilon's initial value, decayed by a factor for each episode down to its minimum.
+
+    Differs: also where sejax falls linearly (`exploration_steps`); a random action costs less.
+    """
     if episode == 0:
         return hp.epsilon_init
     return max(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)

@@ -1,9 +1,9 @@
 """sejax's agents beside those of Stable-Baselines3 and rejax, with equal settings on real tasks.
 
-Networks, batches, rates, targets, noise, random first steps and the number of steps are equal; an
-off-policy agent learns once in each step. What stays as a library has it: initial weights, the
-order of an update's parts, and in Stable-Baselines3 the Huber loss of DQN. An agent plays ten
-greedy episodes after its last step.
+Networks, batches, rates, targets, noise, random first steps and the number of steps are equal, but
+that rejax's SAC has no random ones; an off-policy agent learns once in each step. What stays as a
+library has it: initial weights, the order of an update's parts, and in Stable-Baselines3 the Huber
+loss of DQN. An agent plays ten greedy episodes after its last step.
 
 At a time limit Stable-Baselines3 bootstraps and rejax does not. sejax's agents train both ways, and
 each library is compared with the way that is its own. Of rejax there are the agents whose settings
@@ -319,7 +319,7 @@ def report(settings: Agents, rows: pd.DataFrame) -> pd.DataFrame:
     table = tables.as_texts(summary, columns).replace(r".*\bnan\b.*", "", regex=True)
     note = (
         f"Mean return of {TEST_EPISODES} greedy episodes after the last step (agents); of the "
-        "difference Welch's 95% interval over agents."
+        "difference Welch's 95% interval over agents. rejax's discrete SAC ends with nan."
     )
     return tables.publish(settings, "Agents of three libraries", table, summary, note)
 

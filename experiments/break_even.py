@@ -11,9 +11,9 @@ learning it:
 - *tuned*: agents of the kind that is fastest there, of those of `preset=best`, whose settings were
   tuned on other seeds. Pilots, of yet other seeds, choose the kind. On an RN they train too.
 
-Solved means that ten tests in a row have reached the threshold on average or, if students of an SE
-return less, their mean. Beside it stands what a bandit costs that copies a policy
-(`experiments.null_baselines`, read when the table is made).
+Solved means that the last ten tests, or all if there are fewer, have reached the threshold on
+average or, if students of an SE return less, their mean. Beside it stands what a bandit costs that
+copies a policy (`experiments.null_baselines`, read when the table is made).
 """
 
 import functools

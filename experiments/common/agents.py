@@ -137,7 +137,12 @@ def train_groups(
     for first in range(0, len(groups), at_once):
         chosen = names[first : first + at_once]
         made_with = {
-            name: shared | {"group": groups[name].name, "weights": groups[name].fingerprint}
+            name: {
+                **shared,
+                "group": groups[name].name,
+                "weights": groups[name].fingerprint,
+                "place": names.index(name),  # which its keys depend on
+            }
             for name in chosen
         }
 

@@ -139,6 +139,7 @@ class Study:
             rows = agents.train_groups(condition, settings, self.num_pilots, TIMED)
             yield self.labelled(rows, "pilot", kind)
             steps[kind] = rows["train_steps"].mean()
+        self.settings.shards.made_with |= settings.shards.made_with
         return min(steps, key=steps.__getitem__)
 
     def curves(self, kind: str) -> pd.DataFrame:
@@ -150,7 +151,7 @@ class Study:
         return curves.thinned(rows.drop(columns="group"), grid, self.target)
 
     def until_solved(self, is_terminal: bool = False) -> TrainingConfig:
-        """Training that ends when ten tests, one after each episode, reach the target."""
+        """Training that ends when the last ten tests, or all if fewer, reach the target."""
         most = self.settings.limit(self.task)
         return TrainingConfig(
             max_steps=most,
@@ -196,7 +197,9 @@ class Study:
     def labelled(self, rows: pd.DataFrame, role: str, kind: str) -> pd.DataFrame:
         """What is kept of rows, and whose they are."""
         own = {"role": role, "kind": kind, "target": self.target}
-        return rows[KEPT].assign(**own, most_steps=self.settings.limit(self.task))
+        most = self.settings.limit(self.task)
+        steps = rows["train_steps"].mask(rows["nonfinite"], most)  # a diverged agent solves nothing
+        return rows[KEPT].assign(**own, most_steps=most, train_steps=steps)
 
 
 def kinds_for(task: Task) -> tuple[str, ...]:
