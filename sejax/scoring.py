@@ -181,12 +181,11 @@ class Scoring:
             repaired, mean = self.evaluations.incumbent_scores(*of_agent)
             all_scores = all_scores.at[on_incumbent].set(repaired)
             means.append(mean)
-        population, incumbent = jnp.split(all_scores, [num_in_population])
         agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
         return Scores(
-            population=population,
-            incumbent=incumbent,
+            population=scores[:num_in_population],
+            incumbent=all_scores[num_in_population:],
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
             diverged=~jnp.isfinite(scores),
