@@ -172,20 +172,20 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        num_in_population = scores.size - self.evaluations.num_incumbent_evals
-        all_scores, means = scores, []
+        means, num_in_population = [], scores.size - self.evaluations.num_incumbent_evals
+        population, incumbent = jnp.split(scores, [num_in_population])
         for agent_index in range(self.mixture.size):
             numbers = self.trainings_of(agent_index)
-            on_incumbent = numbers[numbers >= num_in_population]
-            of_agent = scores[on_incumbent], scores[numbers[numbers < num_in_population]]
+            on_incumbent = numbers[numbers >= num_in_population] - num_in_population
+            of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
             repaired, mean = self.evaluations.incumbent_scores(*of_agent)
-            all_scores = all_scores.at[on_incumbent].set(repaired)
+            incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
         return Scores(
-            population=scores[:num_in_population],
-            incumbent=all_scores[num_in_population:],
+            population=population,
+            incumbent=incumbent,
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
             diverged=~jnp.isfinite(scores),
