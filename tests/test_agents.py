@@ -47,7 +47,16 @@ EXPLORING = [
 every_agent = pytest.mark.parametrize("case", [*PLAIN, *EXPLORING], ids="-".join)
 # DQN is DDQN with another target.
 OFF_POLICY = [case for case in PLAIN if case[0] not in ("dqn", "ppo", "q_learning", "sarsa")]
-every_off_policy_agent = pytest.mark.parametrize("case", OFF_POLICY, ids="-".join)
+# The others compile for long.
+QUICK = ("ddqn", "td3", "ppo", "q_learning", "sarsa")
+
+
+def cases(of_agents):
+    marks = {x: [pytest.mark.slow] * (x[0] not in QUICK or x[2] == "icm") for x in of_agents}
+    return [pytest.param(x, marks=marks[x]) for x in of_agents]
+
+
+every_off_policy_agent = pytest.mark.parametrize("case", cases(OFF_POLICY), ids="-".join)
 
 
 @functools.cache
@@ -144,9 +153,7 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     assert agent.spec.sizes is not None
 
 
-@pytest.mark.parametrize(
-    "case", [*PLAIN, *(pytest.param(x, marks=pytest.mark.slow) for x in EXPLORING)], ids="-".join
-)
+@pytest.mark.parametrize("case", cases([*PLAIN, *EXPLORING]), ids="-".join)
 def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alone(case):
     _, agent, start = parts(case)
     hparams = agent.hparams if case[2] == "none" else agent.hparams.agent
@@ -191,7 +198,7 @@ def test_an_agent_is_made_once_for_equal_configurations(name):
 # --- agents with a replay buffer -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", [*OFF_POLICY, *EXPLORING[:2]], ids="-".join)
+@pytest.mark.parametrize("case", cases([*OFF_POLICY, *EXPLORING[:2]]), ids="-".join)
 def test_columns_of_no_weight_change_nothing(case):
     state, batch = started(case)
     update, key = update_of(case), jax.random.key(0)

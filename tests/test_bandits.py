@@ -4,13 +4,10 @@ import dataclasses
 
 import jax
 import numpy as np
-import pandas as pd
 import pytest
 
-from experiments import null_baselines
 from experiments.common import agents, bandits
 from experiments.common.bandits import PolicyBandit
-from experiments.common.shards import stack
 from sejax import envs
 
 CARTPOLE, CAR = envs.make("cartpole"), envs.make("mountain_car_continuous")
@@ -57,6 +54,7 @@ def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
     assert tests < copied.real_steps < 110_000
 
 
+@pytest.mark.slow
 def test_a_search_ends_when_its_steps_are_spent():
     task = dataclasses.replace(envs.make("pendulum"), max_steps=9, params=None)  # of all episodes
     teacher = bandits.searched(task, real_steps=1, seed=0)
@@ -81,19 +79,3 @@ def test_a_table_of_noise_has_the_units_of_the_task_and_the_actions_of_the_polic
     assert (copied.actions == (copied.states @ GAINS > 0)).all()
     car = by_hand(envs.make("mountain_car"), num_states=512, widen=np.inf)
     assert np.allclose(car.states.std(0), [0.45, 0.035], rtol=0.15)  # half of each bound
-
-
-def summary(source, group, returns, **maker):
-    """The row of DDQN agents of these returns that learned from one thing."""
-    made = {"source": [source], "group": group, "real_steps": 7, "cpu_s": 1.0} | maker
-    students = {"source": source, "group": group, "kind": "ddqn", "hparams": "default",
-                "agent": range(len(returns)), "steps": 2000, "test_return": returns}  # fmt: skip
-    rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
-    (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
-    return row
-
-
-def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
-    """Two of twenty, though nineteen have the return of the tenth quantile."""
-    row = summary("by_hand", "hand-00", [100] + [200] * 19, policy_return=200.0)
-    assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100

@@ -116,6 +116,7 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     assert len(np.unique(data, axis=0)) == len(data) == 3 * 12
 
 
+@pytest.mark.slow
 def test_candidates_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trainings one by one with tests of one step, and tell."""
     program = program_of("devices=1", "objective.first_eval_steps=1", words=ROOM)
@@ -160,6 +161,7 @@ def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(r
     assert_result_equals_run(result, program, states, infos, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_learner_vmapped_over_keys_equals_separate_runs(room):
     # On both devices at once: the program of the README.
     program, _, runs = room

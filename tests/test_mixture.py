@@ -172,6 +172,7 @@ def two():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_keys_may_be_of_the_old_kind(two):
     generation = jax.jit(lambda key: two.bilevel.generations(two.bilevel.init(key), 1)[1])
     old, new = (generation(key) for key in (jax.random.PRNGKey(3), jax.random.key(3)))

@@ -118,6 +118,7 @@ def balances(obs):
     return (obs @ [0.1, 0.3, 1.0, 0.6] > 0).astype(int)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "policy", "hidden_size", "most"),
     [(PENDULUM, swings_up, 8, 0.2), (CARTPOLE, balances, 0, 0.4)],

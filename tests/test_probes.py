@@ -68,9 +68,10 @@ AGENTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [(name, kind) for name, config in AGENTS.items() for kind in config.actions]
-)
+@pytest.mark.parametrize(("name", "kind"), [
+    pytest.param(name, kind, marks=[pytest.mark.slow] * (name in ("sac", "td3_discrete")))
+    for name, config in AGENTS.items() for kind in config.actions
+])  # fmt: skip
 def test_a_bandits_best_action_is_found(name, kind):
     config = AGENTS[name]
     task = sejax.Task(name="bandit", env=Bandit(kind == "discrete"))

@@ -84,6 +84,7 @@ def test_the_checker_finds_the_select_of_a_plainly_vmapped_loop():
     assert_in_place(jax.jit(plain).lower(lasts[0]).compile().as_text())
 
 
+@pytest.mark.slow
 def test_vmapped_trainings_of_wide_networks_are_mapped_ones_to_the_bit():
     task, units = envs.make("cartpole"), 24  # more than columns in a batch
     config = DDQNConfig(num_layers=2, hidden_size=units, batch_size=16, warmup_episodes=1)

@@ -354,6 +354,7 @@ def make(reward: float = math.nan):
 """
 
 
+@pytest.mark.slow
 def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, monkeypatch, capsys):
     (tmp_path / "my_broken.py").write_text(BROKEN)
     monkeypatch.chdir(tmp_path)

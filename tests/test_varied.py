@@ -219,6 +219,7 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert values["discount"] != variant.hparams.agent.discount
 
 
+@pytest.mark.slow
 def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key():
     task = envs.make("cartpole")
     config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9, warmup_episodes=1)
