@@ -24,7 +24,7 @@ TINY = {
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
     "read_a_set": ["--agents=3", "--size=2", "--generations=2"],
     "other_suites": ["env=gymnax/Catch-bsuite", "env.solved_reward=0.8", "generations=1",
-                     "es.population_size=2", "training.max_steps=30"],
+                     "es.population_size=2", "training.max_steps=200"],
     "train_thousands": ["--agents=6", "--num_parallel=2"],
     "sb3_agents": ["--steps=10", "--seeds=1", "--episodes=1"],
     "sbx_agent": ["--steps=10", "--seeds=1", "--episodes=1"],
