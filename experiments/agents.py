@@ -319,7 +319,7 @@ def report(settings: Agents, rows: pd.DataFrame) -> pd.DataFrame:
     table = tables.as_texts(summary, columns).replace(r".*\bnan\b.*", "", regex=True)
     note = (
         f"Mean return of {TEST_EPISODES} greedy episodes after the last step (agents); of the "
-        "difference Welch's 95% interval over agents. rejax's discrete SAC ends with nan."
+        "difference Welch's 95% interval over agents."
     )
     return tables.publish(settings, "Agents of three libraries", table, summary, note)
 

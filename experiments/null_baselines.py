@@ -170,9 +170,8 @@ def compute(settings: NullBaselines) -> pd.DataFrame:
             groups.append(as_group(bandit, name, rows))
             makers.append({"source": source, "group": name, **rows.iloc[0][list(COSTS)]})
         if source == "evolved" and (card := shipped(settings.env)):
-            env, _ = sejax.load(settings.env)
-            groups = [Group.of("shipped", sejax.load_proxy(settings.env))]
-            num_agents = settings.num_evolved
+            proxy, num_agents = sejax.load_proxy(settings.env), settings.num_evolved
+            env, groups = proxy.env, [Group.of("shipped", proxy)]
             costs = {name: getattr(card.learning, name, np.nan) for name in COSTS}
             makers.append({"source": source, "group": "shipped", **costs})
         if groups:
