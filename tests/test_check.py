@@ -135,6 +135,7 @@ def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     assert "proxy.min_steps (1" in str(refusal(run, path, out_dir=tmp_path / "other"))
 
 
+@pytest.mark.slow
 def test_a_reward_network_is_judged_by_training_steps(tmp_path):
     path = save(tmp_path / "rn.safetensors", "env=gridworld_2x2", "proxy=rn")
     found = run(path, out_dir=tmp_path / "out", algorithms="[]")

@@ -101,7 +101,7 @@ def test_numbers_and_tables_are_written(project, tmp_path):
 
 
 def test_a_changed_row_of_an_experiment_is_found(tmp_path):
-    name = "results/peers"
+    name = "results/agents"
     shutil.copytree(claims.ROOT / name, tmp_path / name)  # whose table is that of its rows
     path = tmp_path / name / "rows.csv.xz"
     rows = pd.read_csv(path)

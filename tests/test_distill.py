@@ -107,6 +107,7 @@ def test_damaged_files_and_runs_of_another_command_are_refused(copied):
     assert refused(main, words) == "run_dir"
 
 
+@pytest.mark.slow
 def test_a_function_that_has_changed_gets_students_of_its_own(tmp_path, monkeypatch):
     returns = []
     for sign in (1.0, -1.0):

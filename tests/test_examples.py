@@ -15,7 +15,6 @@ import sejax
 from sejax.proxies import header
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SLOW = ("own_objective", "own_task", "own_proxy", "read_a_set", "other_suites")
 TINY = {
     "algorithm1": ["--generations=0"],
     "own_task": ["--generations=1", "--population=2", "--steps=60"],
@@ -79,8 +78,8 @@ def test_every_example_is_tested():
 def _marked(name):
     """An example with its marks: warnings of another package are its own."""
     own = [pytest.mark.filterwarnings("default")] if name in NEEDS else []
-    # The dearest; a command below uses the task, the proxy and the objective of three.
-    return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (name in SLOW)])
+    is_quick = name in ("algorithm1", *NEEDS)  # the others compile for seconds
+    return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (not is_quick)])
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in TINY])

@@ -381,7 +381,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_it_starts_no_backend_of_jax_and_its_ids_are_known_in_new_processes(context):
     """In a fresh process, as the test's own has what its processes would need to import."""
     program = PROGRAM.replace("CONTEXT", context)
