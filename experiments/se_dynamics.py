@@ -6,7 +6,7 @@ same as probabilities (`bernoulli`); with ends at a threshold, which no episode 
 before a tenth of the task's step limit; and with ten steps an episode at most. With ends at a
 threshold, SEs are learned from two, three and four algorithms at once too. The best SE of each run
 then trains fresh agents of several kinds, and takes the myopia test (`se_myopia`): what agents of
-the first algorithm that it was learned with learn on it with smaller discounts.
+the alphabetically first algorithm that it was learned with learn on it with smaller discounts.
 
 All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
 """

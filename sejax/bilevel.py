@@ -196,7 +196,7 @@ def make_learner(
         if not callable(getattr(config, "parts", None)) or parts:
             raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
-    generations = checked([generations], Count, "generations", 100)
+    generations = checked(generations, Count, "generations", 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

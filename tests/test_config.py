@@ -20,6 +20,7 @@ from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.compose import expand
 from sejax.runs.config import LearnConfig
+from sejax.runs.run_directory import RunDirectory
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"]
 
@@ -187,7 +188,7 @@ def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, 
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
     values = config.plain()
     assert configuration.learn_config(values) == config
-    assert configuration.completed(values, config) == values
+    assert RunDirectory(config).completed(values) == values
     if len(config.agents) == 1:  # as files had it before
         older = values | {"agent": config.plain()["agents"].popitem()[1], "agents": None}
         assert configuration.learn_config(older) == config

@@ -32,14 +32,13 @@ def test_an_entry_comes_back_and_another_is_none(folder):
     assert [path.name for path in folder.iterdir()] == ["rounds.safetensors"]
 
 
-def test_entries_of_other_settings_are_refused_with_what_differs(folder):
+def test_entries_of_other_settings_are_refused_with_what_differs(folder, monkeypatch):
     error = refusal(Store(folder, SETTINGS | {"seed": 3}, field="work").get, "rounds")
     assert error.field == "work" and "seed (0 there, 3 here)" in str(error)
     more = SETTINGS | {"devices": 2}
     assert Store(folder, more, free={"devices"}).get("rounds")
-    with_default = Store(
-        folder, SETTINGS | {"new": 1}, completed=lambda stored: stored | {"new": 1}
-    )
+    with_default = Store(folder, SETTINGS | {"new": 1})
+    monkeypatch.setattr(Store, "completed", lambda _, stored: stored | {"new": 1})
     assert with_default.get("rounds")
 
 

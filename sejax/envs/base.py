@@ -78,7 +78,7 @@ class Task(TaskSpec):
         try:
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
-            max_steps = options.checked([limit], options.Count, "env.max_steps", 200)
+            max_steps = options.checked(limit, options.Count, "env.max_steps", 200)
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
             require_own_steps(env)

@@ -79,7 +79,7 @@ def make_vec(
       ((8, 4), 'NextStep')
     """
     _, world = _read(source, task)
-    num_envs = checked([num_envs], Count, "num_envs", 8)
+    num_envs = checked(num_envs, Count, "num_envs", 8)
     if world is None:
         env_fns = [partial(make, source, task)] * num_envs
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
@@ -106,7 +106,7 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     from sejax.gym.sb3 import SyntheticVecEnv
 
     _, world = _read(source, task)
-    num_envs = checked([num_envs], Count, "num_envs", 8)
+    num_envs = checked(num_envs, Count, "num_envs", 8)
     if world is None:
         return DummyVecEnv([partial(make, source, task)] * num_envs)
     return SyntheticVecEnv(world, num_envs)

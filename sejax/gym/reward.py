@@ -63,7 +63,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = configure("proxy", header.config["proxy"])
         discount = header.discount if discount is None else discount
-        self.discount = checked([discount], Fraction, "discount", header.discount)
+        self.discount = checked(discount, Fraction, "discount", header.discount)
         weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()
         if weighs_info or self.config.augmented:  # the task's configuration has the keys
             spec = envs.spec_of(configured("env", header.config["env"], header.task))

@@ -111,7 +111,7 @@ def spread_groups_over_devices(
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
     for name, count in (("devices", num_devices), ("num_parallel", num_parallel)):
-        checked([count], Count, name, None)
+        checked(count, Count, name, None)
     available = jax.devices()
     must = f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null."
     require(num_devices is None or num_devices <= len(available), "devices", must)

@@ -212,7 +212,7 @@ class Options:
         for field in dataclasses.fields(self):
             name = f"{self.group}.{field.name}".lstrip(".")
             value = getattr(self, field.name)
-            value = checked([value], hints[field.name], name, field.default)
+            value = checked(value, hints[field.name], name, field.default)
             object.__setattr__(self, field.name, value)
 
 
@@ -235,36 +235,35 @@ def hints_of(cls: type, where: str) -> dict[str, Any]:
     return hints
 
 
-def checked(candidates: Iterable[Any], hint: Any, name: str, default: Any) -> Any:
+def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
     """A value that pydantic has converted to its field's type.
 
     Args:
-      candidates: possible readings of the value; the first one that fits counts.
+      value: any value.
       hint: the type.
       name: the field's name, for messages.
       default: the field's default; if it is None, None fits.
 
     Raises:
-      ConfigError: if none fits.
+      ConfigError: if it does not fit.
     """
-    must, got = "", None
-    for got in map(as_python, candidates):
-        if got is None and default is None:
-            return None
-        try:
-            value = _adapter(hint).validate_python(got)
-        except ValidationError as error:
-            problem = error.errors()[0]
-            if typing.get_origin(hint) is Literal:
-                raise unknown_name(name, str(got), typing.get_args(hint)) from None
-            must = problem["msg"].removeprefix("Input should ").partition(", unable")[0]
-            for bound, words in (("ge", "at least"), ("le", "at most")):
-                if bound in problem.get("ctx", {}):
-                    must = f"be {words} {problem['ctx'][bound]}"
-        else:
-            if isinstance(got, bool) == isinstance(value, bool):  # bools are numbers in Python
-                return value
-            must = f"be {'' if isinstance(value, bool) else 'no '}true or false"
+    got = as_python(value)
+    if got is None and default is None:
+        return None
+    try:
+        converted = _adapter(hint).validate_python(got)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        if typing.get_origin(hint) is Literal:
+            raise unknown_name(name, str(got), typing.get_args(hint)) from None
+        must = problem["msg"].removeprefix("Input should ").partition(", unable")[0]
+        for bound, words in (("ge", "at least"), ("le", "at most")):
+            if bound in problem.get("ctx", {}):
+                must = f"be {words} {problem['ctx'][bound]}"
+    else:
+        if isinstance(got, bool) == isinstance(converted, bool):  # bools are numbers in Python
+            return converted
+        must = f"be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     fix = "VALUE" if is_open else as_text(default)
     raise ConfigError(f"{name} must {must}; got {shortened(repr(got))}. Set {name}={fix}.", name)

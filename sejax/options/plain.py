@@ -181,12 +181,15 @@ def _read(
         require(isinstance(value, Mapping), name, message)
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name, imports)
-    candidates = [value]
+    reading = value
     if isinstance(value, str):
-        candidates = [parsed(expanded(value)), expanded(value)]
-    elif type(value) in (int, float):  # it may be a name of digits, such as a folder's
-        candidates = [value, str(value)]
-    return checked(candidates, hint, name, default)
+        value = expanded(value)
+        reading = parsed(value)
+    elif type(value) in (int, float):
+        value = str(value)  # it may be a name of digits, such as a folder's
+    with suppress(ConfigError):
+        return checked(reading, hint, name, default)
+    return checked(value, hint, name, default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

@@ -376,15 +376,3 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
     return LearnConfig.of_tree(old.file_of_today(values), imports)
-
-
-def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
-    """A stored run's values with the defaults of fields that an older version did not write.
-
-    The defaults of new fields change no number. A `module:attribute` is imported only if `config`
-    has it too.
-    """
-    try:
-        return learn_config(stored, {*map(str, flatten(config.plain()).values())}).plain()
-    except ConfigError:
-        return dict(stored)

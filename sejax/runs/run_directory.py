@@ -7,7 +7,7 @@ refused changes nothing.
 
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import Self, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import jax
 import numpy as np
@@ -16,6 +16,8 @@ from jax import Array
 from jaxtyping import PyTree
 
 from sejax.ops.files import remove_leftovers, write_text
+from sejax.options import ConfigError
+from sejax.options.plain import flatten
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
@@ -65,13 +67,7 @@ class RunDirectory(Store):
     """
 
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
-        super().__init__(
-            config.resolved_run_dir,
-            config.plain(),
-            field=field,
-            free=FREE_FIELDS,
-            completed=lambda stored: configuration.completed(stored, config),
-        )
+        super().__init__(config.resolved_run_dir, config.plain(), field=field, free=FREE_FIELDS)
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
         self.versions: object = runtime.versions()
@@ -94,6 +90,17 @@ class RunDirectory(Store):
             self.__exit__()
             raise
         return self
+
+    def completed(self, stored: dict[str, Any]) -> dict[str, Any]:
+        """Stored settings with the defaults of fields that an older version did not write.
+
+        These defaults change no number.
+        """
+        imports = {*map(str, flatten(self.settings).values())}
+        try:
+            return configuration.learn_config(stored, imports).plain()
+        except ConfigError:
+            return stored
 
     def last(self, column: str) -> str:
         """A column's value in the last saved row; 0 if there is none."""

@@ -31,7 +31,6 @@ class Store:
       settings: plain values in nested mappings, on which all entries depend.
       field: the field that names the folder, for messages.
       free: groups and fields of the first level that may differ: they say how to compute, not what.
-      completed: adds the fields that an older version did not write to stored settings.
 
     Attributes:
       settings: the settings as they are stored, with lists for tuples.
@@ -55,12 +54,10 @@ class Store:
         *,
         field: str = "run_dir",
         free: Collection[str] = (),
-        completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     ):
         self.folder = folder
         self.settings: dict[str, Any] = json.loads(json.dumps(settings))
-        self._field, self._hint = field, f"Set {field}=FOLDER."
-        self._free, self._completed = free, completed
+        self._field, self._free = field, free
         self._lock = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
         self._is_used = False
 
@@ -110,7 +107,8 @@ class Store:
         self._is_used = True
         differing = differences(stored, self.settings, self._free, most=2)
         if differing:
-            differing = differences(self._completed(stored), self.settings, self._free, most=2)
+            stored = self.completed(stored)
+            differing = differences(stored, self.settings, self._free, most=2)
         if differing:
             must = "must be new or made with the same settings"
             raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
@@ -147,6 +145,10 @@ class Store:
             self.put(name, tensors)
         return tensors
 
+    def completed(self, stored: dict[str, Any]) -> dict[str, Any]:
+        """Stored settings with the fields that an older version did not write."""
+        return stored
+
     def damaged(self, name: str, error: Exception) -> ConfigError:
         """The error for an entry that cannot be read, with the reason."""
         self._is_used = True
@@ -154,4 +156,4 @@ class Store:
 
     def refused(self, message: str) -> ConfigError:
         """The error for a folder that cannot be used; the message follows its field."""
-        return ConfigError(f"{self._field} {message}. {self._hint}", self._field)
+        return ConfigError(f"{self._field} {message}. Set {self._field}=FOLDER.", self._field)
