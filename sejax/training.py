@@ -115,7 +115,8 @@ class TrainResult:
         same form; None if there are no such tests.
       episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
         after the last.
-      nonfinite: whether a number that is not finite was met: an output of a proxy, or a weight.
+      nonfinite: whether a number that is not finite was met: an output of a proxy, or
+        a float of the agent's state.
       eval_steps: real steps spent on tests between training episodes, `[]` int32.
       stored: arrays of the agent's buffer at the end, if the trainer keeps them; else None.
     """
@@ -218,6 +219,8 @@ def make_trainer(
     must = f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}"
     fix = "Set agent=sejax.make_agent(config, task) with that task."
     require(agent.spec.sizes in (None, sizes), "agent", f"{must}. {fix}")
+    must = "must have fixed hyperparameters here; make_evaluator draws them. Set varied=False."
+    require(agent.varied is None, "agent", must)
     require_part("training", TrainingConfig, training)
     require_modes()
     if training.num_tests_between and test_fn is None:

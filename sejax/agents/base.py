@@ -43,7 +43,10 @@ class Hparams(SimpleNamespace):
 
 
 class ActFn(Protocol):
-    """The action for one observation; `explore` is a Python bool."""
+    """The action for one observation; `explore` is a Python bool.
+
+    The key must come from `split` or `fold_in`: the words of `jax.random.key(n)` are not random.
+    """
 
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
 

@@ -28,7 +28,7 @@ from sejax.agents.tabular import entry_of, mask_of
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, Dense
 from sejax.ops.optimizers import ADAM, apply_gradient
-from sejax.options import Count, Depth, Fraction, NonNegative, Positive, option
+from sejax.options import Count, Depth, Fraction, NonNegative, Positive, option, require
 
 
 def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
@@ -37,6 +37,8 @@ def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agen
     Its state holds the inner agent's state as `agent_state`. Its hyperparameters hold the inner
     agent's as `agent`.
     """
+    fix = "must have fixed hyperparameters. Set make_agent(config, task, exploration, varied=True)."
+    require(agent.varied is None, "agent", fix)
 
     def begin_episode(state: AgentState, episode: Array) -> AgentState:
         return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))

@@ -150,4 +150,4 @@ def mask_of(state: Int[Array, ""], action: Int[Array, ""], shape: tuple[int, int
     """True at one entry of a table of this shape, `[num_states, num_actions]` bool."""
     num_states, num_actions = shape
     entry = jnp.arange(num_states * num_actions, dtype=jnp.int32).reshape(shape)
-    return entry == state * num_actions + action
+    return entry == state.astype(jnp.int32) * num_actions + action
