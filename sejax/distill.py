@@ -200,7 +200,7 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     path, plain = folder / "proxy.safetensors", config.plain()
     learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
-    write_text(folder / "card.md", zoo.describe(header.read(path)).card + "\n")
+    write_text(folder / "card.md", zoo.describe(header.read(path), str(folder)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
 

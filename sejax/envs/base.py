@@ -92,7 +92,7 @@ class Task(TaskSpec):
             results = "obs, state, reward, terminated and info"
             fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
             raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
-            message = f"env must be a gymnax 1.x environment with EnvParams; {raised}"
+            message = f"env must be a gymnax 1.x environment, in JAX, with EnvParams; {raised}"
             raise options.ConfigError(message, "env") from error
         known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}

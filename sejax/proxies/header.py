@@ -130,11 +130,10 @@ def configured(group: str, values: object, where: str) -> Any:
     if is_registered(group, values):
         return configure(group, values, ())  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
-    field = PLUGIN_ARGUMENTS.get(group, group)
-    word = PLUGIN_WORDS.get(group, group)
-    must = f"must be registered for {shortened(where, 40)}, as what a file names is never imported"
-    fix = f"Set {field}=..., or {word}=MODULE:NAME in a command"
-    raise ConfigError(f"{field} {must}; got {shortened(name, 40)}. {fix}.", field)
+    field, name = PLUGIN_ARGUMENTS.get(group, group), shortened(name, 40)
+    must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
+    fix = f"If you trust it, set {PLUGIN_WORDS.get(group, group)}={name}, in Python {field}=..."
+    raise ConfigError(f"{field} {must}; got {name}. {fix}", field)
 
 
 # --- where a file is ------------------------------------------------------------------------------

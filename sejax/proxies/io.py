@@ -30,7 +30,7 @@ from sejax.proxies.header import Header, Stored, check_tensors
 from sejax.training import TrainingConfig
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class _Loaded:
     """What is common to a stored proxy and a set of them.
 
@@ -45,6 +45,9 @@ class _Loaded:
     config: dict[str, Any]
     discount: float
     path: Path
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.path)!r})"
 
     @property
     def task(self) -> Task:
@@ -81,7 +84,7 @@ class _Loaded:
         return {key: header.configured("agent", values, where) for key, values in stored}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Proxy(_Loaded):
     """A stored proxy.
 
@@ -110,7 +113,7 @@ def fingerprint(weights: PyTree) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ProxySet(_Loaded):
     """Proxies that share a configuration, and hence every compiled program.
 

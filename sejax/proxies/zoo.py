@@ -65,7 +65,7 @@ class Learning:
     cpu_s: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class PretrainedProxy:
     """What a proxy's file tells about it.
 
@@ -95,6 +95,9 @@ class PretrainedProxy:
     evaluations: tuple[Evaluation, ...] = ()
     learning: Learning | None = None
     policy_return: float | None = None
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r})"
 
     @property
     def on_proxy(self) -> tuple[Evaluation, ...]:

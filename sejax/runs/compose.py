@@ -260,7 +260,7 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     if name not in sections:
         ranked = nearest(name, sections)
         must = f"preset must be one that {shortened(env)} has ({listed(ranked)})"
-        got = f"got {shortened(name)}. Did you mean preset={ranked[0]}?"
+        got = f"got {shortened(name)}. Set preset={ranked[0]}."
         raise ConfigError(f"{must}; {got}", "preset")
     section = sections[name]
     default = registry.find("proxy", proxy, imports).default_objective

@@ -75,7 +75,7 @@ class RunProgress:
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
         arguments += f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else ""
         self.say(
-            f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'learned'}\n"
+            f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'finished'}\n"
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"
