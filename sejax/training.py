@@ -95,10 +95,10 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         return
     assert training.max_steps is not None
     episodes = -(-training.max_steps // max_episode_steps)
-    field, got = f"{name}.max_episodes", training.max_episodes
+    got = training.max_episodes
     must = f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of"
-    must += f" at most {max_episode_steps} steps; got {got}. Set {field}={episodes}."
-    require(got >= episodes, field, must)
+    must += f" at most {max_episode_steps} steps"
+    require(got >= episodes, f"{name}.max_episodes", must, got=got, use=episodes)
 
 
 @struct.dataclass
