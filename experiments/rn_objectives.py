@@ -61,12 +61,9 @@ class RnObjectives(CurveSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         least = len(self.picks) * self.rns
-        require(
-            self.learned >= least,
-            "learned",
-            f"must be at least {least}, of which the best and the worst are picked; got "
-            f"{self.learned}. Set learned={least} or picks=best.",
-        )
+        must = f"must be at least {least}, of which the best and the worst are picked"
+        use = f"{least} or picks=best"
+        require(self.learned >= least, "learned", must, got=self.learned, use=use)
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:

@@ -63,11 +63,8 @@ def compute(settings: SeFeasibility) -> pd.DataFrame:
 def learning_config(settings: SeFeasibility) -> Any:
     """The configuration of the NES runs."""
     config = settings.learn_config([f"agent_hparams={settings.agent_hparams}"])
-    require(
-        config.name("proxy") != "rn",
-        "run.proxy",
-        "must be an SE; got rn. Set run.proxy=se, or run experiments.rn_performance.",
-    )
+    use = "se, or run experiments.rn_performance"
+    require(config.name("proxy") != "rn", "run.proxy", "must be an SE", got="rn", use=use)
     return config
 
 

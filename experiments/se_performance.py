@@ -122,12 +122,10 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
         learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
-        require(
-            learned_with == name,
-            name,
-            f"must be SEs learned with {name} hyperparameters; got {shortened(ses.path)} with "
-            f"{learned_with} ones. Set {learned_with}={shortened(ses.path)}.",
-        )
+        got = f"{shortened(ses.path)} with {learned_with} ones"
+        must = f"must be SEs learned with {name} hyperparameters; got {got}"
+        fix = f"Set {learned_with}={shortened(ses.path)}."
+        require(learned_with == name, name, must, fix=fix)
         solved = solved_ones(ses)
         sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
     return sets
@@ -136,11 +134,8 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
 def task_name(sets: dict[str, Any]) -> str:
     """The one task of all sets; without one CartPole."""
     names = sorted({str(ses.task.name) for ses in sets.values()})
-    require(
-        len(names) <= 1,
-        "fixed",
-        f"must be SEs of the same task as varied; got {', '.join(names)}. Set fixed=FILE.",
-    )
+    must = "must be SEs of the same task as varied"
+    require(len(names) <= 1, "fixed", must, got=", ".join(names), use="FILE")
     return names[0] if names else "cartpole"
 
 

@@ -257,7 +257,6 @@ def make_bilevel(
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )
-    can_stop = not stop_when_solved or bilevel.solved_score is not None
     must = "must be false, as scores of this objective and task cannot say solved; got true."
-    require(can_stop, "stop_when_solved", must)
+    require(not stop_when_solved or bilevel.solved_score is not None, "stop_when_solved", must)
     return bilevel

@@ -130,8 +130,8 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
-    fix = "must have a pool of workers, as ray has. Leave it out."
-    require(hasattr(config.machines, "pool"), "machines", fix)
+    has_pool = hasattr(config.machines, "pool")
+    require(has_pool, "machines", "must have a pool of workers", use="ray")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
     others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}

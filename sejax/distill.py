@@ -121,8 +121,8 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
     values, texts = compose.partition(overrides, DistillConfig)
     for name in [name for name in texts if name.partition(".")[0] not in USED]:
         fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-        message = f"must be left out, as it has no effect here. {fix}"
-        raise ConfigError(f"{shortened(name, 40)} {message}", name)
+        must = "must be left out, as it has no effect here"
+        raise ConfigError.of(shortened(name, 40), must, fix=fix)
     words = [f"{name}={text}" for name, text in texts.items()]
     config = configuration.config(words, StudentsConfig)
     require(config.agent_hparams == "default", "agent_hparams", "has no effect here. Leave it out.")

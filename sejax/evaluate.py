@@ -88,7 +88,7 @@ class EvaluateConfig(CommandConfig):
         super().__post_init__()
         for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
             is_idle = self.proxy == "real" and getattr(self, name) == idle
-            require(not is_idle, name, f"must be left out with proxy=real; got {idle}.")
+            require(not is_idle, name, "must be left out with proxy=real", got=idle)
         default, training = to_plain(TRAINING), to_plain(self.training).items()
         changed = shortened(", ".join(f"{k}={x}" for k, x in training if x != default[k]))
         fix = "" if self.proxy == "real" else "training_from=config, or "
@@ -281,15 +281,15 @@ def loaded(config: EvaluateConfig) -> Proxy:
     proxy = load_proxy(path, task, proxy_config, "proxy")
     name = proxy.task.name
     is_same = config.env in (None, name, proxy.config["env"].get("name"))
-    require(is_same, "env", f"must be the proxy's own task; got {config.env}. Set env={name}.")
+    require(is_same, "env", "must be the proxy's own task", got=config.env, use=name)
     return proxy
 
 
 def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
     """How long agents train on an SE, by the SE's file."""
-    message = "must be config for an SE whose file does not say how long agents train. Set "
-    fix = "training_from=config training.max_steps=2000 training.max_episodes=2000."
-    require("training" in proxy.config, "training_from", message + fix)
+    must = "must be config for an SE whose file does not say how long agents train"
+    use = "config training.max_steps=2000 training.max_episodes=2000"
+    require("training" in proxy.config, "training_from", must, use=use)
     test_episodes = config.real_training.test_episodes
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
 

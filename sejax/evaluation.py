@@ -245,9 +245,9 @@ def make_evaluator(
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_part("training", TrainingConfig, training)
     most = 1000 * max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
-    must = f"must be at most {most:,}, as an agent may never end a test; got {task.max_steps:,}"
-    message = f"{must} for {task.name}. Set env.max_steps=N, or Task(max_steps=N)."
-    require(task.max_steps <= most, "env.max_steps", message)
+    must = f"must be at most {most:,}, as an agent may never end a test"
+    got = f"{task.max_steps:,} for {task.name}"
+    require(task.max_steps <= most, "env.max_steps", must, got=got, use="N, or Task(max_steps=N)")
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)

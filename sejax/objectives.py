@@ -161,9 +161,9 @@ class RewardThreshold(ObjectiveConfig):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        must = f"must be another one, as {task.name} has no solved reward; got reward_threshold."
+        must = f"must be another one, as {task.name} has no solved reward"
         fix = "Set env.solved_reward=N, or objective=max_reward."
-        require(task.is_solvable, "objective", f"{must} {fix}")
+        require(task.is_solvable, "objective", must, got="reward_threshold", fix=fix)
 
         def score(outcome: Outcome) -> Array:
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)

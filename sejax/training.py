@@ -95,10 +95,10 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         return
     assert training.max_steps is not None
     episodes = -(-training.max_steps // max_episode_steps)
-    field, got = f"{name}.max_episodes", training.max_episodes
+    got = training.max_episodes
     must = f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of"
-    must += f" at most {max_episode_steps} steps; got {got}. Set {field}={episodes}."
-    require(got >= episodes, field, must)
+    must += f" at most {max_episode_steps} steps"
+    require(got >= episodes, f"{name}.max_episodes", must, got=got, use=episodes)
 
 
 @struct.dataclass
@@ -219,8 +219,8 @@ def make_trainer(
     must = f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}"
     fix = "Set agent=sejax.make_agent(config, task) with that task."
     require(agent.spec.sizes in (None, sizes), "agent", f"{must}. {fix}")
-    must = "must have fixed hyperparameters here; make_evaluator draws them. Set varied=False."
-    require(agent.varied is None, "agent", must)
+    fix = "Set varied=False; sejax.make_evaluator draws them."
+    require(agent.varied is None, "agent", "must have fixed hyperparameters here", fix=fix)
     require_part("training", TrainingConfig, training)
     require_modes()
     if training.num_tests_between and test_fn is None:

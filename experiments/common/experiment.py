@@ -75,12 +75,9 @@ class Settings(options.Options):
                 require_known(field.name, name, choices)
         for word in fields.get("run", ()):
             name = word.partition("=")[0]
-            require(
-                name not in fields,
-                RUN_PREFIX + name,
-                f"must be given as {name}, as results are filed by it; got {shortened(word)}. "
-                f"Set {shortened(word)}.",
-            )
+            must = f"must be given as {name}, as results are filed by it"
+            fix = f"Set {shortened(word)}."
+            require(name not in fields, RUN_PREFIX + name, must, got=word, fix=fix)
 
     @classmethod
     def of(cls, **given: Any) -> Self:

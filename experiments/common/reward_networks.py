@@ -262,11 +262,9 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     if differing == ["generations"] and made_with["generations"] < asked["generations"]:
         return None
     if differing:
-        raise ConfigError(
-            f"rns_dir must be a new folder or hold RNs of the same settings; got {path} with "
-            f"another {listed(differing)}. Set rns_dir=DIR, or these settings.",
-            "rns_dir",
-        )
+        got = f"{path} with another {listed(differing)}"
+        must = f"must be a new folder or hold RNs of the same settings; got {got}"
+        raise ConfigError.of("rns_dir", must, use="DIR, or these settings")
     return there
 
 

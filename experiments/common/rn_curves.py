@@ -67,11 +67,8 @@ class CurveSettings(RnSettings):
             require_known("rows", row, self.study.rows)
         for bonus in self.bonuses:
             require_known("bonuses", bonus, (*self.study.bonuses, "none"))
-        require(
-            self.rns <= self.learned,
-            "rns",
-            f"must be at most learned={self.learned}; got {self.rns}. Set learned={self.rns}.",
-        )
+        must = f"must be at most learned={self.learned}; got {self.rns}"
+        require(self.rns <= self.learned, "rns", must, fix=f"Set learned={self.rns}.")
 
     def agent(self, row: str) -> Any:
         """The agent that is trained in a row."""

@@ -94,12 +94,9 @@ def learn(configs: list[Any], option: str = "work", chunks: Chunks | None = None
             session.run(config, directory, timed(chunks, path))
             curve = pd.DataFrame(directory.rows).apply(pd.to_numeric)
         there = int(curve["generation"].max()) + 1 if len(curve) else 0
-        require(
-            there <= config.generations,
-            "generations",
-            f"must be at least {there}, as the run in {config.run_dir} has so many; got "
-            f"{config.generations}. Set generations={there}, or another folder.",
-        )
+        must = f"must be at least {there}, as the run in {config.run_dir} has so many"
+        use = f"{there}, or another folder"
+        require(there <= config.generations, "generations", must, got=config.generations, use=use)
         best = curve["best_so_far"].max()
         print(f"{config.run_dir}: {there} generations, best {best:.1f}", flush=True)
         curves.append(curve.assign(cpu_s=pd.Series(read_costs(path, len(curve)))))
@@ -188,6 +185,5 @@ def read_costs(path: Path, generations: int) -> np.ndarray:
     except FileNotFoundError:
         return np.array([])
     except ValueError as error:
-        raise ConfigError(
-            f"work must hold whole files; {path} is damaged. Set work=DIR.", "work"
-        ) from error
+        must = f"must hold whole files; {path} is damaged"
+        raise ConfigError.of("work", must, use="DIR") from error

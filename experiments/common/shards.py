@@ -85,11 +85,8 @@ class Shards:
             print(f"{path} is damaged: it is computed again.", flush=True)
             return None
         if differing:
-            raise ConfigError(
-                f"work must be a new folder or that of the same experiment; {path} differs in "
-                f"{differing}. Set work=DIR.",
-                "work",
-            )
+            must = "must be a new folder or that of the same experiment"
+            raise ConfigError.of("work", f"{must}; {path} differs in {differing}", use="DIR")
         return table
 
 
@@ -111,16 +108,12 @@ def read_rows(path: Path) -> pd.DataFrame:
     try:
         rows = pd.read_csv(path, low_memory=False)  # a column has one type throughout
     except FileNotFoundError as error:
-        raise ConfigError(
-            f"from_rows needs stored rows; there is no {path}. Set from_rows=false, or out=DIR.",
-            "from_rows",
-        ) from error
+        needs = f"needs stored rows; there is no {path}"
+        raise ConfigError.of("from_rows", needs, use="false, or out=DIR") from error
     except DAMAGE as error:
-        raise ConfigError(
-            f"from_rows needs whole rows; {path} is damaged ({' '.join(str(error).split())[:80]}). "
-            "Restore the file, or set from_rows=false to make it again.",
-            "from_rows",
-        ) from error
+        damage = f"{path} is damaged ({' '.join(str(error).split())[:80]})"
+        fix = "Restore the file, or set from_rows=false to make it again."
+        raise ConfigError.of("from_rows", f"needs whole rows; {damage}", fix=fix) from error
     if _DIFFERENCES in rows:
         rows = rows.assign(**{_DIFFERENCES: rows[_DIFFERENCES].cumsum()})
     return rows.rename(columns={_DIFFERENCES: _GROWING})

@@ -104,17 +104,17 @@ def require_fit(
     Raises:
       ConfigError: if one of them does not fit.
     """
+    name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
-        known, got = fitting(spec), shortened(registry.name_of("agent", agent))
-        must = f"{field} must be one of {', '.join(known) or 'your own'} in {task_name} with"
-        must += f" {spec.states} states and {spec.actions} actions; got {got}"
-        fix = f"Set agent={known[0]}" if known and field == "agent" else "Leave it out"
-        raise ConfigError(f"{must}. {fix}.", field)
+        known = fitting(spec)
+        must = f"must be one of {', '.join(known) or 'your own'} in {task_name} with"
+        must += f" {spec.states} states and {spec.actions} actions"
+        fix = f"Set agent={known[0]}." if known and field == "agent" else "Leave it out."
+        raise ConfigError.of(field, must, got=name, fix=fix)
     if exploration.states is not None and agent.states not in (None, exploration.states):
-        agent_name = shortened(registry.name_of("agent", agent))
-        exploration_name = shortened(registry.name_of("exploration", exploration))
-        must = f"exploration must be one for {agent.states} states with agent={agent_name}; got"
-        raise ConfigError(f"{must} {exploration_name}. Set exploration=none.", "exploration")
+        must = f"must be one for {agent.states} states with agent={shortened(name)}"
+        got = registry.name_of("exploration", exploration)
+        raise ConfigError.of("exploration", must, got=got, use="none")
 
 
 def default_for(spec: TaskSpec) -> str:

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
-from sejax.options import Options, require, shortened
+from sejax.options import Options, require
 from sejax.options.registry import require_part
 
 Weight = Annotated[float, Field(ge=0, le=1e6)]
@@ -75,9 +75,9 @@ class Mixture:
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
         is_weighted = min(self.weights, default=0) >= 0 and max(self.weights, default=0) > 0
         is_whole = is_weighted and len(self.names) == len(self.weights) == size
-        must = f"must have a name and a weight each, one above 0 and none below; got {size} agents"
-        got = f"names={shortened(self.names)} and weights={shortened(self.weights)}"
-        require(is_whole, "agents", f"{must}, {got}. Set names=() and weights=().")
+        must = "must have a name and a weight each, one above 0 and none below"
+        got = f"{size} agents, names={self.names} and weights={self.weights}"
+        require(is_whole, "agents", must, got=got, fix="Set names=() and weights=().")
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":
@@ -113,9 +113,9 @@ class Mixture:
             hands[int(np.argmax(behind))].append(candidate)
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
-        field, size = "es.population_size", 2 * int(1 / shares[shares > 0].min() + self.size + 1)
-        got = f"got {num_dealt} perturbations for weights {shortened(self.weights)}"
-        require(are_enough, field, f"must leave each agent one; {got}. Set {field}={size}.")
+        size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
+        got = f"{num_dealt} perturbations for weights {self.weights}"
+        require(are_enough, "es.population_size", "must leave each agent one", got=got, use=size)
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 

@@ -195,9 +195,9 @@ class PPO(Learner):
         length: int,
         max_action: float | None = None,
     ):
-        field, number, most = "agent.num_minibatches", config.num_minibatches, max(1, length // 2)
-        must = f"must be at most half of the rollout's {length} steps; got {number}"
-        require(number <= most, field, f"{must}. Set {field}={most}.")
+        number, most = config.num_minibatches, max(1, length // 2)
+        must = f"must be at most half of the rollout's {length} steps"
+        require(number <= most, "agent.num_minibatches", must, got=number, use=most)
         self.config, self.obs_dim, self.length = config, obs_dim, length
         self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
         shape = (config.hidden_size, config.num_layers, config.activation)

@@ -28,7 +28,7 @@ from sejax import options
 from sejax.agents import make_agent
 from sejax.distillation.policy_search import Arrays, Lesson, random_map
 from sejax.envs.base import Task
-from sejax.options import ConfigError, Count, Options, WholeNumber, registry, require, shortened
+from sejax.options import Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import configure
 from sejax.proxies.exact import Layer, forward, require_vectors
 from sejax.runs.store import Store
@@ -83,7 +83,7 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
         return _of_agent(text, task, agent_steps, key)
     if text.endswith(".zip"):
         return _checked(_of_sb3(text, task), task)
-    require(":" in text, "policy", f"must be a model or a function; got {shortened(text)}. {FIX}")
+    require(":" in text, "policy", "must be a model or a function", got=text, fix=FIX)
     return _checked(registry.imported("policy", text), task)
 
 
@@ -97,12 +97,12 @@ def _checked(act: Actor, task: Task) -> Actor:
         try:
             actions = np.asarray(act(obs), float)
         except Exception as error:
-            message = f"policy must act in {task.name}; it raised {options.told(error)}."
-            raise ConfigError(message, "policy") from error
+            fault = f"must act in {task.name}; it raised {options.told(error)}."
+            raise options.ConfigError.of("policy", fault) from error
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
-        got = f"got {list(actions.shape)}, such as {shortened(actions.ravel()[:3], 40)}"
+        got = f"{list(actions.shape)}, such as {actions.ravel()[:3]}"
         is_fit = actions.shape == shape and known.all()
-        require(is_fit, "policy", f"must give {must} of the shape {list(shape)}; {got}.")
+        require(is_fit, "policy", f"must give {must} of the shape {list(shape)}", got=got)
         return actions
 
     return checked
@@ -115,13 +115,13 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # of any kind: the file, the algorithm or the library
-        got = f"got {shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
-        message = f"policy must be a model that its algorithm saved; {got}. {FIX}"
-        raise ConfigError(message, "policy") from error
+        got = f"{shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
+        must = f"must be a model that its algorithm saved; got {got}"
+        raise options.ConfigError.of("policy", must, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     is_discrete, space = task.num_actions is not None, model.action_space
-    must = f"must have the actions of {task.name}; got {shortened(space)}"
-    require(hasattr(space, "n") == is_discrete, "policy", f"{must}. {FIX}")
+    must = f"must have the actions of {task.name}"
+    require(hasattr(space, "n") == is_discrete, "policy", must, got=space, fix=FIX)
     low, high = np.asarray((-1, 1) if is_discrete else (space.low, space.high), float)
     middle, factor = (low + high) / 2, 2 * task.max_action / (high - low)
     return lambda obs: (model.predict(obs, deterministic=True)[0] - middle) * factor

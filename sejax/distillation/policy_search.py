@@ -79,8 +79,8 @@ class SearchConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         most = self.num_directions
-        got = f"got {self.num_top} of {most}. Set search.num_top={most}"
-        require(self.num_top <= most, "search.num_top", f"must be at most all directions; {got}.")
+        must = f"must be at most all directions; got {self.num_top} of {most}"
+        require(self.num_top <= most, "search.num_top", must, use=most)
 
 
 class Policy(NamedTuple):

@@ -92,8 +92,8 @@ class Task(TaskSpec):
             results = "obs, state, reward, terminated and info"
             fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
             raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
-            message = f"env must be a gymnax 1.x environment, in JAX, with EnvParams; {raised}"
-            raise options.ConfigError(message, "env") from error
+            must = f"must be a gymnax 1.x environment, in JAX, with EnvParams; {raised}"
+            raise options.ConfigError.of("env", must) from error
         known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)
@@ -115,12 +115,12 @@ def require_own_steps(env: Environment) -> None:
       ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`, and for
         what has no `step_env`, such as a task.
     """
-    must = f"must have reset_env and step_env, as gymnax's have; got {type(env).__name__}"
-    fix = "Derive a wrapper from sejax.envs.wrappers.Wrapper; of a task pass task.env"
+    must = "must have reset_env and step_env, as gymnax's have"
+    fix = "Derive a wrapper from sejax.envs.wrappers.Wrapper; of a task pass task.env."
     methods = dir(type(env))
     is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
     is_whole &= hasattr(env, "step_env")
-    options.require(is_whole, "env", f"{must}. {fix}.")
+    options.require(is_whole, "env", must, got=type(env).__name__, fix=fix)
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:
@@ -149,6 +149,5 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
     wanted, got = map(types, jax.eval_shape(step, jax.random.key(0)))
     keys = [x for x in wanted | got if wanted.get(x) != got.get(x)]
     faults = [f"{x} is {got.get(x)}, not {wanted.get(x)}" for x in keys]
-    got_faults = f"got {name}, where {options.shortened('; '.join(faults), 120)}"
-    fix = "Cast in reset_env and step_env what differs"
-    options.require(not faults, "env", f"must keep its shapes; {got_faults}. {fix}.")
+    must = f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}"
+    options.require(not faults, "env", must, fix="Cast in reset_env and step_env what differs.")

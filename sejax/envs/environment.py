@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Bool
 
 from sejax.envs.spec import Box, Discrete, Space, TaskSpec
-from sejax.options import ConfigError, shortened
+from sejax.options import ConfigError
 
 
 @struct.dataclass
@@ -171,6 +171,6 @@ def _of_gymnax(space: Any, what: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
         return Box(low, high)
-    fix = "Make them one array in a subclass of sejax.envs.wrappers.Wrapper"
-    must = f"must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}"
-    raise ConfigError(f"env {must}. {fix}.", "env")
+    must = f"must have {what} in a gymnax Box or Discrete space"
+    fix = "Make them one array in a subclass of sejax.envs.wrappers.Wrapper."
+    raise ConfigError.of("env", must, got=repr(space), fix=fix)

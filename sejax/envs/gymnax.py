@@ -51,8 +51,8 @@ class GymnaxTask(Options):
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
             raised = f"{gymnax_id} raised {options.told(error)}"
-            message = f"env must be an environment that gymnax can make here; {raised}."
-            raise options.ConfigError(message, "env") from error
+            must = f"must be an environment that gymnax can make here; {raised}."
+            raise options.ConfigError.of("env", must) from error
         usual = SOLVED_REWARD.get(gymnax_id, math.inf)
         solved = usual if self.solved_reward is None else self.solved_reward
         max_steps = self.max_steps or params.max_steps_in_episode

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from sejax.envs.environment import Environment, EnvParams, EnvState, Params, State, Step, spaces_of
 from sejax.envs.spec import Box, Discrete, Space
-from sejax.options import require, shortened
+from sejax.options import require
 
 
 class Wrapper(Environment[State, Params]):
@@ -202,9 +202,9 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
         has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32
     if isinstance(action, Box):
         low, high = np.array(action.low), np.array(action.high)
-        fix = f"got {shortened(action)}. Give its action space a finite low and high"
+        fix = "Give its action space a finite low and high."
         is_bounded = np.isfinite([low, high]).all() and (low < high).all()
-        require(is_bounded, "env", f"must have bounded actions; {fix}.")
+        require(is_bounded, "env", "must have bounded actions", got=action, fix=fix)
         is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # the same [-x, x] everywhere
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
         return env

@@ -56,8 +56,8 @@ class EvosaxConfig(StrategyOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_known("es.name", self.name, ALGORITHMS)
-        size, field = self.population_size, "es.population_size"
-        require(size % 2 == 0, field, f"must be even; got {size}. Set {field}={size + 1}.")
+        size = self.population_size
+        require(size % 2 == 0, "es.population_size", "must be even", got=size, use=size + 1)
         for name, algorithms in (("noise_std_decay", "open_es"), ("step_size", "open_es pgpe")):
             value, is_used = getattr(self, name), self.name in algorithms.split()
             message = f"must be left out with es={self.name}, which has none; got {value}."

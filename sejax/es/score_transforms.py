@@ -117,8 +117,8 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
             with jax.ensure_compile_time_eval():
                 weights = np.asarray(jax.jit(function)(scores), float)
         except Exception as error:
-            must = f"{FIELD} must be a function of scores [pop] that jax can trace"
-            raise ConfigError(f"{must}; {choice} raised {told(error)}.", FIELD) from error
+            must = "must be a function of scores [pop] that jax can trace"
+            raise ConfigError.of(FIELD, f"{must}; {choice} raised {told(error)}.") from error
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
         got = f"got {weights.tolist()!s:.60} of shape {list(weights.shape)} for the scores"
         must = f"must give a finite weight for each of {pop} scores; {got} {scores.tolist()!s:.40}"

@@ -146,4 +146,4 @@ def _require_task(env: Env, header: Header) -> None:
         and signature(env.unwrapped.action_space) == signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
     )
-    require(is_same, "env", f"{must}; got {shortened(env)}.")
+    require(is_same, "env", must, got=env)

@@ -67,7 +67,7 @@ class RealTask:
           ConfigError: if it has no such limit.
         """
         limit = env.spec.max_episode_steps if env.spec else None
-        require(limit, "task", f"must have a step limit; got {shortened(env)}. Set max_steps.")
+        require(limit, "task", "must have a step limit", got=env, fix="Set max_steps.")
         return cls(
             observation_space=env.observation_space,
             action_space=env.action_space,
@@ -101,8 +101,8 @@ def real_env(header: Header, **options: Any) -> Env:
     fields = to_plain(configure("env", config)) if is_known else {}
     is_known &= fields.pop("backend", "mujoco") != "spring"  # it has other dynamics
     must = "must be given, because Gymnasium does not have the same task"
-    fix = "task=ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
-    require(is_known, "task", f"{must}; got {shortened(config)}. Set {fix}.")
+    use = "ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
+    require(is_known, "task", must, got=config, use=use)
     if name in GRIDS:
         return TimeLimit(GridWorld(name, **fields), limit)
     return gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
@@ -131,13 +131,12 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
         task = RealTask.of_env(env)
     has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
     must = f"must have the SE's actions, {learned.action_space}, and its step limit, {limit}"
-    got = f"got {shortened(task.action_space)} and {task.max_steps}"
-    fix = "Set max_steps, or wrap it in RescaleAction"
+    got = f"{task.action_space} and {task.max_steps}"
     is_same = has_limit and task.action_space == learned.action_space
-    require(is_same, "task", f"{must}; {got}. {fix}.")
+    require(is_same, "task", must, got=got, fix="Set max_steps, or wrap it in RescaleAction.")
     seen, known = task.observation_space, learned.observation_space
-    must = f"must have the SE's observations, {shortened(known)}; got {shortened(seen)}."
-    require(signature(seen) == signature(known), "task", must)
+    must = f"must have the SE's observations, {shortened(known)}"
+    require(signature(seen) == signature(known), "task", must, got=seen)
     return replace(task, observation_space=known)
 
 

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sejax.options import ConfigError, shortened
+from sejax.options import ConfigError
 
 
 def cache_folder() -> Path | None:
@@ -36,8 +36,8 @@ def require_writable(field: str, folder: Path) -> None:
             pass
         remove_empty(new_folders)
     except (OSError, ValueError) as error:
-        message = f"{field} must be a folder that can be written; got {shortened(error)}."
-        raise ConfigError(f"{message} Set {field}=FOLDER.", field) from error
+        must = "must be a folder that can be written"
+        raise ConfigError.of(field, must, got=error, use="FOLDER") from error
 
 
 def missing(folder: Path) -> list[Path]:

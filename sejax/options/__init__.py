@@ -37,7 +37,7 @@ from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
@@ -60,6 +60,16 @@ class ConfigError(ValueError):
         super().__init__(message)
         self.field = field
 
+    @classmethod
+    def of(
+        cls, field: str, message: str, *, got: object = ..., use: object = ..., fix: str = ""
+    ) -> Self:
+        """The error that `require` raises with these arguments."""
+        value = "" if got is ... else f"; got {shortened(got)}"
+        fix = fix if use is ... else f"Set {field}={use}."
+        end = f". {fix}".rstrip() if value or fix else ""
+        return cls(f"{field} {message}{value}{end}", field)
+
 
 class FailedError(RuntimeError):
     """A computation that cannot go on. Commands print its message and exit with status 1."""
@@ -78,16 +88,26 @@ def errors_of(group: str, where: str) -> Iterator[None]:
         raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
 
 
-def require(holds: object, field: str, message: str) -> None:
+def require(
+    holds: object, field: str, message: str, *, got: object = ..., use: object = ..., fix: str = ""
+) -> None:
     """Raises `ConfigError` unless `holds`.
 
     Args:
       holds: what must be true.
       field: the field at fault.
-      message: the rest of the message: the rule, `; got` the value, and how to fix it.
+      message: the rule; with none of the following the whole message, to its full stop.
+      got: the value, which the message shortens.
+      use: a value that holds, for `Set FIELD=VALUE.`
+      fix: another sentence that says how to fix it.
+
+    Example:
+      >>> require(0 % 2, "es.population_size", "must be odd", got=0, use=1)
+      Traceback (most recent call last):
+      sejax.options.ConfigError: es.population_size must be odd; got 0. Set es.population_size=1.
     """
     if not holds:
-        raise ConfigError(f"{field} {message}", field)
+        raise ConfigError.of(field, message, got=got, use=use, fix=fix)
 
 
 def require_package(field: str, package: str, extra: str) -> None:
@@ -238,7 +258,7 @@ def hints_of(cls: type, where: str) -> dict[str, Any]:
         hints, *bounded = (typing.get_type_hints(x, include_extras=True) for x in cls.__mro__)
         plain, *others = (typing.get_type_hints(x) for x in cls.__mro__)
     except NameError as error:
-        raise ConfigError(f"{where} must have fields of known types: {error}.", where) from error
+        raise ConfigError.of(where, f"must have fields of known types: {error}.") from error
     for of_base, plain_of_base in zip(bounded, others, strict=True):
         same = [x for x in of_base if plain_of_base[x] == plain[x] == hints[x]]
         hints |= {name: of_base[name] for name in same}
@@ -275,8 +295,8 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
             return converted
         must = f"be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
-    fix = "VALUE" if is_open else as_text(default)
-    raise ConfigError(f"{name} must {must}; got {shortened(repr(got))}. Set {name}={fix}.", name)
+    use = "VALUE" if is_open else as_text(default)
+    raise ConfigError.of(name, f"must {must}", got=repr(got), use=use)
 
 
 @functools.cache

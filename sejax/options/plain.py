@@ -90,8 +90,7 @@ def configure(group: str, values: Any, imports: Collection[str] | None = None) -
       0.9
     """
     is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
-    message = f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME."
-    require(is_choice, group, message)
+    require(is_choice, group, "must be a choice with its fields", got=values, use="NAME")
     cls = registry.find(group, values["name"], imports)
     known = fields_of(cls)
     fields = {k: v for k, v in values.items() if k != "name" or k in known}
@@ -131,7 +130,7 @@ def from_plain(
         fields[name] = _read(value, hints[name], full[name], *how)
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
-        require(is_known, full[name], f"must be given; it has no default. Set {full[name]}=VALUE.")
+        require(is_known, full[name], "must be given; it has no default", use="VALUE")
     with errors_of(getattr(cls, "group", where), where):
         return cls(**fields)
 
@@ -150,9 +149,9 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     field, last = shortened(field, 40), field.rpartition(".")[2]
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
-    fix = f" Did you mean {ranked[0]}?" if ranked else ""
+    fix = f"Did you mean {ranked[0]}? " if ranked else ""
     is_no = "is no field any more" if last in old.GONE else "is no field"
-    return ConfigError(f"{field} {is_no}.{fix} Fields: {listed(ranked)}.", field)
+    return ConfigError.of(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
 def _read(
@@ -176,9 +175,8 @@ def _read(
             return configure(group, value, imports)
     is_dataclass = isinstance(hint, type) and dataclasses.is_dataclass(hint)
     if is_dataclass and not isinstance(value, hint):
-        fields = f"have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
-        message = f"must {fields}; got {shortened(repr(value))}. Leave it out."
-        require(isinstance(value, Mapping), name, message)
+        must = f"must have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
+        require(isinstance(value, Mapping), name, must, got=repr(value), fix="Leave it out.")
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name, imports)
     reading = value

@@ -245,9 +245,8 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     key = (group, config if is_hashable(config) else id(config), *arguments)
     if key not in _PARTS:
         part = config.make(*arguments)
-        if not isinstance(part, cls):
-            got = f"{type(part).__name__} from {shortened(name_of(group, config))}"
-            raise ConfigError(f"{group} must make a sejax.{cls.__name__}; got {got}.", group)
+        got = f"{type(part).__name__} from {name_of(group, config)}"
+        require(isinstance(part, cls), group, f"must make a sejax.{cls.__name__}", got=got)
         _PARTS[key] = config, part  # while config is kept, no other object gets its id
     return cast(T, _PARTS[key][1])
 
@@ -271,8 +270,8 @@ def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
       ConfigError: for anything else.
     """
     fix = fix or "Pass an object; sejax.config([...]) takes names."
-    message = f"must be a sejax.{cls.__name__}; got {shortened(repr(part))}. {fix}"
-    require(isinstance(part, cls), group, message)
+    must = f"must be a sejax.{cls.__name__}"
+    require(isinstance(part, cls), group, must, got=repr(part), fix=fix)
     return cast(T, part)
 
 
@@ -285,9 +284,9 @@ def require_typed(field: str, path: str, imports: Collection[str] | None) -> Non
     Raises:
       ConfigError: if it is not one of `imports`.
     """
-    got = shortened(path, 60)
-    message = f"must be typed, as names in files are never imported; got {got}. Set {field}={got}"
-    require(imports is None or path in imports, field, f"{message}, if you trust it.")
+    must = "must be typed, as names in files are never imported"
+    use = f"{shortened(path, 60)}, if you trust it"
+    require(imports is None or path in imports, field, must, got=path, use=use)
 
 
 def require_path(field: str, path: str) -> None:
@@ -298,9 +297,9 @@ def require_path(field: str, path: str) -> None:
     """
     module, _, attribute = path.partition(":")
     is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
-    got, fix = (shortened(x, 60) for x in (path, *_suggestions(path), "my_module:MyClass")[:2])
-    message = f"must be a name or module:attribute; got {got}. Set {field}={fix}."
-    require(is_path and not module.endswith(".py"), field, message)
+    use = shortened((*_suggestions(path), "my_module:MyClass")[0], 60)
+    must = "must be a name or module:attribute"
+    require(is_path and not module.endswith(".py"), field, must, got=path, use=use)
 
 
 def _suggestions(text: str) -> list[str]:
@@ -321,9 +320,8 @@ def imported(field: str, path: str) -> Any:
         return resolve_name(path)
     except Exception as error:
         hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
-        got = shortened(path, 60)
-        message = f"{field} must name what can be imported; {got} raised {told(error)}.{hint}"
-        raise ConfigError(message, field) from error
+        must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}.{hint}"
+        raise ConfigError.of(field, must) from error
 
 
 @functools.cache
@@ -333,10 +331,10 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     parameters = list(signature.parameters.values())
     options = parameters[len(arguments) :]
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
-    must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got"
+    must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field"
     is_fit = len(parameters) >= len(arguments) and not is_open
     is_fit &= all(p.name != "name" for p in options)  # which is the choice's own
-    require(is_fit, group, f"{must} {shortened(f'{name}{signature}')}.")
+    require(is_fit, group, must, got=f"{name}{signature}")
 
     def make(self: object, *parts: object) -> Any:
         return function(*parts, **{p.name: getattr(self, p.name) for p in options})

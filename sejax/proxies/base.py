@@ -71,9 +71,9 @@ class ProxyConfig(Options, ABC):
 
     def _error(self, name: str, value: object, why: str) -> ConfigError:
         """Error for a field with one allowed value; in the message `why` follows that value."""
-        field, fix, got = f"{self.group}.{name}", as_text(value), as_text(getattr(self, name))
-        must = f"{field} must be {fix} {shortened(why, 120)}"
-        return ConfigError(f"{must}; got {shortened(got)}. Set {field}={fix}.", field)
+        only, got = as_text(value), as_text(getattr(self, name))
+        must = f"must be {only} {shortened(why, 120)}"
+        return ConfigError.of(f"{self.group}.{name}", must, got=got, use=only)
 
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":

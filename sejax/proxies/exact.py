@@ -92,8 +92,8 @@ def require_vectors(task: Task) -> None:
     Raises:
       ConfigError: if they are not.
     """
-    must = f"must have vectors as observations; got {task.name}. Set env=cartpole."
-    require(task.num_states is None, "env", must)
+    must = "must have vectors as observations"
+    require(task.num_states is None, "env", must, got=task.name, use="cartpole")
 
 
 def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:

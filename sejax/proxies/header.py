@@ -133,7 +133,7 @@ def configured(group: str, values: object, where: str) -> Any:
     field, name = PLUGIN_ARGUMENTS.get(group, group), shortened(name, 40)
     must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
     fix = f"If you trust it, set {PLUGIN_WORDS.get(group, group)}={name}, in Python {field}=..."
-    raise ConfigError(f"{field} {must}; got {name}. {fix}", field)
+    raise ConfigError.of(field, must, got=name, fix=fix)
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -165,8 +165,8 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     if name in pretrained_names():
         return PRETRAINED_DIR / f"{name}.safetensors"
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
-        there = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
-        raise ConfigError(f"{option} {there}; got {shortened(name)}, where there is none.", option)
+        must = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
+        raise ConfigError.of(option, f"{must}; got {shortened(name)}, where there is none.")
     raise unknown_name(option, name, [*pretrained_names(), *also])
 
 
@@ -194,14 +194,13 @@ def read(
         tensors, plain = checksummed.read(path, KIND)
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
-        got = f"got {where} ({shortened(error, 60)})"
-        raise ConfigError(f"{option} must be whole, as sejax wrote it; {got}.", option) from error
+        must = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
+        raise ConfigError.of(option, must) from error
     must = f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}"
     got = f"got proxy={shortened(header.kind, 40)} in {where}"
     require(not kinds or header.kind in kinds, option, f"{must}; {got}.")
-    is_one = len(header.proxies) == 1 or not single
-    got = f"got a set in {where}. sejax.load_set reads sets"
-    require(is_one, option, f"must be a single proxy; {got}.")
+    must = f"must be a single proxy; got a set in {where}. sejax.load_set reads sets."
+    require(len(header.proxies) == 1 or not single, option, must)
     if single and header.is_set:  # a set of one
         tensors = {name: x[0] for name, x in tensors.items()}
         header = dataclasses.replace(header, is_set=False)

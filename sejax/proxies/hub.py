@@ -43,7 +43,7 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
     match = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
     if match is None:
-        raise ConfigError(f"{option} {must}; got {shortened(repr(address))}.", option)
+        raise ConfigError.of(option, must, got=repr(address))
     repo, revision, file = match.groups()
     return repo, revision, file or FILE
 
@@ -78,7 +78,7 @@ def explained(option: str, address: str) -> Iterator[None]:
     except ConfigError:
         raise
     except Exception as error:  # the HTTP library's too, which depends on huggingface_hub's version
-        fix = "Check the name and the network, or log in: hf auth login"
-        got = f"got {shortened(address, 60)}: {shortened(told(error), 90)}"
-        message = f"{option} must be within reach on the Hub; {got}. {fix}."
-        raise ConfigError(message, option) from error
+        got = f"{shortened(address, 60)}: {shortened(told(error), 90)}"
+        must = f"must be within reach on the Hub; got {got}"
+        fix = "Check the name and the network, or log in: hf auth login."
+        raise ConfigError.of(option, must, fix=fix) from error

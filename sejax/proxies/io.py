@@ -174,8 +174,8 @@ def _stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[s
         return proxy.env, proxy.config
     if isinstance(proxy, ProxyEnv) and proxy.learned_config is not None:
         return proxy, proxy.learned_config
-    fix = "Set env, params = sejax.load(source)"
-    raise ConfigError(f"proxy must be a stored one; got {type(proxy).__name__}. {fix}.", "proxy")
+    fix = "Set env, params = sejax.load(source)."
+    raise ConfigError.of("proxy", "must be a stored one", got=type(proxy).__name__, fix=fix)
 
 
 def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Agent:
@@ -225,9 +225,8 @@ def training_of(
     """
     env, config = _stored_env(proxy)
     stored: Any = config.get("training")
-    must = f"must be given for {shortened(env.name)}, whose file does not tell it"
-    fix = "Set training=sejax.TrainingConfig(...)"
-    require(isinstance(stored, Mapping), "training", f"{must}; got none. {fix}.")
+    must = f"must be given for {shortened(env.name)}, whose file does not tell it; got none"
+    require(isinstance(stored, Mapping), "training", must, use="sejax.TrainingConfig(...)")
     training = from_plain(TrainingConfig, stored, "training")
     if agent is None or training.max_steps is None:
         return training
@@ -297,9 +296,8 @@ def save_set(
     """
     are_weights = weights and all(isinstance(x, Mapping) for x in weights)
     require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
-    is_known = discount is not None or not env.config.needs_discount
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
-    require(is_known, "discount", must)
+    require(discount is not None or not env.config.needs_discount, "discount", must)
     stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
     tensors = flatten_dict(stacked, sep="/")
     _require_weights("weights", tensors, env, len(records), "params.weights")
@@ -325,9 +323,8 @@ def save_set(
         data = checksummed.pack(tensors, header.KIND, vars(stored))
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         must = "must be plain values that sejax.load takes, with numbers for score and seed"
-        fix = "Set config=sejax.config(...).plain()"
-        message = f"config and record {must}; got {shortened(told(error), 60)}. {fix}."
-        raise ConfigError(message, "config") from error
+        use = "sejax.config(...).plain()"
+        raise ConfigError.of("config", f"and record {must}", got=told(error), use=use) from error
     write_bytes(Path(path).expanduser(), data)
 
 
@@ -451,9 +448,9 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
                 raise
             known = json.dumps([learned.interface, learned.config["env"]], sort_keys=True)
             real = _absent_task(learned.task, known, str(error))
-    got = f"got one of {shortened(learned.task, 40)} in {shortened(where, 40)}. Set another task"
-    is_its_task = learned.task == real.name
-    require(is_its_task, option, f"must be a proxy of the task {real.name}; {got}.")
+    must = f"must be a proxy of the task {real.name}"
+    got = f"one of {shortened(learned.task, 30)} in {where}"
+    require(learned.task == real.name, option, must, got=got, fix="Set another task.")
     if task is not None:
         limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
         wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))

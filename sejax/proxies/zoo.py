@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import yaml
 
-from sejax.options import require, shortened
+from sejax.options import require
 from sejax.options.plain import fields_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
@@ -230,7 +230,7 @@ def push(
     """
     stored, address = header.read(source, single=True), f"{hub.SCHEME}{repo}"
     is_repo, config = hub.parse(address, "repo")[0] == repo, stored.header.config
-    require(is_repo, "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
+    require(is_repo, "repo", "must be USER/REPO on the Hub", got=repo)
     needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
     with hub.explained("repo", repo):

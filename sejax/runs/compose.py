@@ -55,8 +55,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
       {'env': 'acrobot', 'agents': '[ddqn,ppo]'}
     """
     is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
-    message = f"must be a list of text; got {shortened(overrides)}."
-    require(is_list, "overrides", f'{message} Set overrides=["env=cartpole"].')
+    require(is_list, "overrides", "must be a list of text", got=overrides, use='["env=cartpole"]')
     texts = {}
     for override in overrides:
         name, equals, text = override.partition("=")
@@ -117,9 +116,9 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
-        got = f"got {shortened(path, 40)} ({shortened(error, 120)})"
-        must = f"preset must be a name, or a YAML file of fields; {got}. Set preset=best."
-        raise ConfigError(must, "preset") from error
+        got = f"{shortened(path, 40)} ({shortened(error, 120)})"
+        must = f"must be a name, or a YAML file of fields; got {got}"
+        raise ConfigError.of("preset", must, use="best") from error
 
 
 def _beside(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
@@ -157,8 +156,8 @@ def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
             names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
             several = ",".join(dict.fromkeys(filter(None, [*chosen, *names]))) or "ddqn,ppo"
             is_clear = all(names) and not chosen and len({*names}) == len(names)
-            message = f"must name each agent once; got {shortened(value)}. Set agents="
-            require(is_clear, name, f"{message}[{shortened(several)}].")
+            fix = f"Set agents=[{shortened(several)}]."
+            require(is_clear, name, "must name each agent once", got=value, fix=fix)
             chosen, path = names, ["agents"]
             value = {key_of(x): {"name": x} for x in names}
         for part in reversed(path):
@@ -259,9 +258,8 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     sections = sections_of(env, proxy)
     if name not in sections:
         ranked = nearest(name, sections)
-        must = f"preset must be one that {shortened(env)} has ({listed(ranked)})"
-        got = f"got {shortened(name)}. Set preset={ranked[0]}."
-        raise ConfigError(f"{must}; {got}", "preset")
+        must = f"must be one that {shortened(env)} has ({listed(ranked)})"
+        raise ConfigError.of("preset", must, got=name, use=ranked[0])
     section = sections[name]
     default = registry.find("proxy", proxy, imports).default_objective
     objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))

@@ -105,8 +105,8 @@ class CommandConfig(Options):
         known = {field.name for field in dataclasses.fields(cls)}
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
-        message = f"must be agents by keys that are words; got {shortened(by_key)}."
-        require(is_map, "agents", f"{message} Set agents=[ddqn,ppo].")
+        must = "must be agents by keys that are words"
+        require(is_map, "agents", must, got=by_key, use="[ddqn,ppo]")
         first, *others = by_key
         with errors_of("" if others else f"agents.{shortened(first, 40)}", "agent"):
             config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
@@ -158,16 +158,16 @@ class CommandConfig(Options):
         """
         longest, got = proxy.max_steps(spec.max_steps), training.solved_by
         require_reachable(group, training, longest)
-        field = f"{group}.solved_by"
-        message = f"must be test, as returns on a proxy say nothing; got {got}. Set {field}=test."
-        require(training.stop_rule != "solved" or got == "test", field, message)
+        must = "must be test, as returns on a proxy say nothing"
+        is_tested = training.stop_rule != "solved" or got == "test"
+        require(is_tested, f"{group}.solved_by", must, got=got, use="test")
         # The shortest episodes: of other proxies they may have one step.
         shortest = longest if proxy.reaches_step_limit else 1
         for name, length, unit in (("max_steps", shortest, 1), ("max_episodes", longest, longest)):
             least = self.agents[key].steps_before_learning(length, spec.max_steps) // unit
             limit, field = getattr(training, name), f"{group}.{name}"
-            must = f"must exceed {least}, where {shortened(key)} begins to learn; got {limit}"
-            require(limit is None or limit > least, field, f"{must}. Set {field}={4 * least}.")
+            must = f"must exceed {least}, where {shortened(key)} begins to learn"
+            require(limit is None or limit > least, field, must, got=limit, use=4 * least)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,9 +308,8 @@ def layers_of(command: type[CommandConfig], overrides: Sequence[str]) -> dict[st
     layers = command.layers_below(typed, compose.plugin_paths(overrides))
     of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
     for name, value in flatten(of_only).items():
-        full, got = f"agents.{chosen[0]}.{name}", shortened(value)
-        message = f"must be one agent's; got {got}. Set {full}={got}."
-        require(len(chosen) == 1, f"agent.{name}", message)
+        fix = f"Set agents.{chosen[0]}.{name}={shortened(value)}."
+        require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
     typed["agents"] = merge({chosen[0]: of_only}, typed["agents"])
     return layers | {"typed": typed}
 

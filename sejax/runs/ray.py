@@ -92,10 +92,9 @@ class RayConfig(Options):
                 warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            must = "machines.address must be a cluster that can be reached"
+            must = f"must be a cluster that can be reached; got {self.address} ({told(error)})"
             fix = "Start one with ray start --head, or set machines.address=local."
-            message = f"{must}; got {self.address} ({told(error)}). {fix}"
-            raise ConfigError(message, "machines.address") from error
+            raise ConfigError.of("machines.address", must, fix=fix) from error
         try:
             yield functools.partial(_on_cluster, self)
         finally:
@@ -285,8 +284,8 @@ def call(versions: dict[str, str], function: Callable[..., Any], item: tuple[Any
     _use_one_core()
     if (here := runtime.versions()) != versions:
         got = f"{here} on {socket.gethostname()} and {versions} here"
-        must = f"machines must have the same versions everywhere; got {got}"
-        raise ConfigError(f"{must}. Install the same versions there.", "machines")
+        must = f"must have the same versions everywhere; got {got}"
+        raise ConfigError.of("machines", must, fix="Install the same versions there.")
     runtime.configure_jax()
     return function(*item)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sejax.ops.files import as_file_name
-from sejax.options import Count, Options, WholeNumber, registry, require, shortened
+from sejax.options import Count, Options, WholeNumber, registry, require
 from sejax.options.plain import from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs import config as configuration
@@ -54,8 +54,8 @@ class StudyConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         least, most = self.min_generations, self.max_generations
-        message = f"must be at least min_generations; got {most}. Set max_generations={9 * least}."
-        require(most >= least, "max_generations", message)
+        must = "must be at least min_generations"
+        require(most >= least, "max_generations", must, got=most, use=9 * least)
 
     @property
     def rungs(self) -> list[int]:
@@ -126,9 +126,9 @@ def read(overrides: Sequence[str]) -> StudyPlan:
     rest = [override for override in overrides if override.partition("=")[0] not in ranges]
     own, others = compose.partition(rest, StudyConfig)
     for name, text in (ranges | others).items():
-        must = f"must be left out, as the search sets it; got {shortened(text)}"
+        must = "must be left out, as the search sets it"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
-        require(name.partition(".")[0] not in SET_BY_SEARCH, name, f"{must}. {fix}")
+        require(name.partition(".")[0] not in SET_BY_SEARCH, name, must, got=text, fix=fix)
     space = {name: spaces.parse(name, text) for name, text in ranges.items()}
     fixed = tuple(f"{name}={text}" for name, text in others.items())
     search = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
@@ -144,5 +144,5 @@ def read(overrides: Sequence[str]) -> StudyPlan:
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
     must = "must be given and have ranges for these agents, or fields must have some; got none"
-    require(space, "space", f"{must}. Set space=paper_se, or es.noise_std='{spaces.EXAMPLE}'.")
+    require(space, "space", must, use=f"paper_se, or es.noise_std='{spaces.EXAMPLE}'")
     return search

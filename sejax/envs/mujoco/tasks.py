@@ -90,9 +90,9 @@ class HalfCheetah(MujocoTask):
 
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
-            fix = f"got {self.backend} ({error}). Install it with pip install 'sejax[brax]'"
-            message = f"env.backend must be mujoco without brax; {fix}."
-            raise ConfigError(message, "env.backend") from error
+            must = f"must be mujoco without brax; got {self.backend} ({error})"
+            fix = "Install it with pip install 'sejax[brax]'."
+            raise ConfigError.of("env.backend", must, fix=fix) from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
