@@ -269,8 +269,8 @@ def loaded(config: EvaluateConfig) -> Proxy:
     Raises:
       ConfigError: if it cannot be loaded, or `env` is not its task.
     """
-    path = header.find(config.proxy, "proxy", also=("real",))
-    stored = header.read(path, "proxy").header.config
+    path, _, learned = header.read(config.proxy, "proxy")
+    stored = learned.config
     task = proxy_config = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}

@@ -43,7 +43,6 @@ from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 MOST, LEAST = 1e30, 1e-30  # of numbers in programs, which compute in 32 bits
-SIMILAR = 0.5  # from here on a name may have been misspelt
 
 
 # --- errors --------------------------------------------------------------------------------------
@@ -117,25 +116,16 @@ def require_package(field: str, package: str, extra: str) -> None:
 
 
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
-    """The error for an unknown choice; it lists known names, and an override."""
+    """The error for an unknown choice; it lists known names, nearest first, and an override."""
     ranked = nearest(got, known)
     message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
-    is_near = similarity(got, ranked[0]) > SIMILAR
-    fix = f"Did you mean {field}={ranked[0]}?" if is_near else f"Set {field}={ranked[0]}."
-    return ConfigError(f"{message} {fix}", field)
+    return ConfigError(f"{message} Set {field}={ranked[0]}.", field)
 
 
 def nearest(got: str, known: Iterable[str]) -> list[str]:
-    """The known names, the most similar first; by the alphabet if none is similar."""
-    ranked = sorted(known, key=lambda name: -similarity(got, name))
-    is_near = ranked and similarity(got, ranked[0]) > SIMILAR
-    return ranked if is_near else sorted(ranked)
-
-
-def similarity(got: str, name: str) -> float:
-    """How similar two names are, from 0 to 1."""
+    """The known names, the most similar first."""
     text = got[:200].lower()  # comparing takes time that grows with the square of the length
-    return SequenceMatcher(None, text, name.lower()).ratio()
+    return sorted(known, key=lambda name: -SequenceMatcher(None, text, name.lower()).ratio())
 
 
 def listed(names: Collection[str], most: int = 120) -> str:

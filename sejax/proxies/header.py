@@ -144,13 +144,12 @@ def pretrained_names() -> list[str]:
     return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
 
 
-def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
+def find(source: str | Path, option: str = "source") -> Path:
     """The file that a run directory, a path, a shipped name or an address on the Hub stands for.
 
     Args:
       source: as in `sejax.load`.
       option: name of the argument, for messages.
-      also: names beside the shipped ones, for messages.
 
     Raises:
       ConfigError: if there is none, or it cannot be fetched.
@@ -167,7 +166,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
         must = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError.of(option, f"{must}; got {shortened(name)}, where there is none.")
-    raise unknown_name(option, name, [*pretrained_names(), *also])
+    raise unknown_name(option, name, pretrained_names())
 
 
 # --- reading and writing --------------------------------------------------------------------------

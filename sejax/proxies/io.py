@@ -5,7 +5,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn, overload
 
@@ -30,7 +30,7 @@ from sejax.proxies.header import Header, Stored, check_tensors
 from sejax.training import TrainingConfig
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Loaded:
     """What is common to a stored proxy and a set of them.
 
@@ -42,12 +42,9 @@ class _Loaded:
     """
 
     env: ProxyEnv
-    config: dict[str, Any]
+    config: dict[str, Any] = field(repr=False)
     discount: float
     path: Path
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.path)!r})"
 
     @property
     def task(self) -> Task:
@@ -84,7 +81,7 @@ class _Loaded:
         return {key: header.configured("agent", values, where) for key, values in stored}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Proxy(_Loaded):
     """A stored proxy.
 
@@ -97,8 +94,8 @@ class Proxy(_Loaded):
       path: the file.
     """
 
-    params: Any
-    record: dict[str, Any]
+    params: Any = field(repr=False)
+    record: dict[str, Any] = field(repr=False)
 
     @property
     def fingerprint(self) -> str:
@@ -113,7 +110,7 @@ def fingerprint(weights: PyTree) -> str:
     return hashlib.sha256(content).hexdigest()[:8]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ProxySet(_Loaded):
     """Proxies that share a configuration, and hence every compiled program.
 
@@ -130,8 +127,8 @@ class ProxySet(_Loaded):
       path: the file.
     """
 
-    weights: PyTree
-    records: tuple[dict[str, Any], ...]
+    weights: PyTree = field(repr=False)
+    records: tuple[dict[str, Any], ...] = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.records)
@@ -147,7 +144,7 @@ class ProxySet(_Loaded):
             records = tuple(self.records[number] for number in numbers)
             return dataclasses.replace(self, weights=weights, records=records)
         params = self.env.params(jax.tree.map(jax.numpy.asarray, weights), self.discount)
-        shared = {field.name: getattr(self, field.name) for field in dataclasses.fields(_Loaded)}
+        shared = {x.name: getattr(self, x.name) for x in dataclasses.fields(_Loaded)}
         shared["env"] = self.env.with_default_params(params, self.config)
         return Proxy(params=params, record=self.records[numbers], **shared)
 

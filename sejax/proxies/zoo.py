@@ -65,7 +65,7 @@ class Learning:
     cpu_s: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True)
 class PretrainedProxy:
     """What a proxy's file tells about it.
 
@@ -87,17 +87,14 @@ class PretrainedProxy:
     name: str
     kind: str
     task: str
-    settings: dict[str, Any]
+    settings: dict[str, Any] = field(repr=False)
     scores: dict[str, float] = field(default_factory=dict)
     objective: str = ""
     generation: int | None = None
     seed: int | None = None
-    evaluations: tuple[Evaluation, ...] = ()
-    learning: Learning | None = None
+    evaluations: tuple[Evaluation, ...] = field(default=(), repr=False)
+    learning: Learning | None = field(default=None, repr=False)
     policy_return: float | None = None
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r})"
 
     @property
     def on_proxy(self) -> tuple[Evaluation, ...]:

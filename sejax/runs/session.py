@@ -53,14 +53,14 @@ def run(
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn, summary_file = time.monotonic(), directory.folder / "run.json"
+    agents = sum(bilevel.evaluate.num_trainings)  # of a generation
     folder, first = directory.folder.resolve(), len(directory.rows)
     run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
     guarded = GuardedTracker(config.tracker, run, report.say)
     with contextlib.closing(guarded) as tracker:
-        while not (state.solved or _all_diverged(directory, bilevel)):
-            first = len(directory.rows)
-            if first >= config.generations:
-                break
+        while not state.solved and (first := len(directory.rows)) < config.generations:
+            if first and all(float(x["num_nonfinite"]) == agents for x in directory.rows):
+                break  # every agent of every generation has diverged
             summary_file.unlink(missing_ok=True)  # it would tell of fewer generations
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
@@ -78,7 +78,7 @@ def run(
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
     ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
-    generations, agents = len(directory.rows), sum(bilevel.evaluate.num_trainings)
+    generations = len(directory.rows)
     counts = {
         "ended": ended,
         "best_score": float(state.best_score) if state.best_generation >= 0 else None,
@@ -134,12 +134,6 @@ def _advance(
     while not pending.is_ready():  # only Python code hears Ctrl-C
         time.sleep(0.02)
     return state, info
-
-
-def _all_diverged(directory: RunDirectory, bilevel: Bilevel) -> bool:
-    """Whether every agent of every generation has diverged; False before the first generation."""
-    rows, agents = directory.rows, sum(bilevel.evaluate.num_trainings)
-    return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
 @contextlib.contextmanager
