@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from pydantic import Field
 
 from sejax.ops.scores import finite_mean
-from sejax.options import LEAST, Count, Options
+from sejax.options import LEAST, MOST, Count, Options
 
 # A number of candidates, each with the weights of a proxy.
 NumMembers = Annotated[int, Field(ge=2, le=100_000)]
@@ -58,7 +58,7 @@ class Evaluations:
 
     def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
         """A score for each candidate; not finite if the score of one evaluation is not finite."""
-        scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
+        scores = jnp.where(jnp.abs(scores) <= MOST, scores, jnp.nan)
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 
     def incumbent_scores(
@@ -71,8 +71,8 @@ class Evaluations:
         mean is nan.
         """
         all_scores = jnp.concatenate([population, scores])
-        lowest = jnp.nanmin(jnp.where(jnp.isfinite(all_scores), all_scores, jnp.nan))
-        finite = jnp.isfinite(scores)
+        lowest = jnp.nanmin(jnp.where(jnp.abs(all_scores) <= MOST, all_scores, jnp.nan))
+        finite = jnp.abs(scores) <= MOST
         repaired = jnp.where(~finite & finite.any(), lowest, scores)
         return repaired, finite_mean(repaired)
 
