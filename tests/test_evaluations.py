@@ -52,7 +52,7 @@ def test_a_members_score_is_not_finite_if_one_evaluation_is_not(aggregate, expec
     # The lowest score of the generation is a member's, -5: (1 - 5 + 10) / 3 = 2.
     ([1, NAN, 10], [-5, 9], [1, -5, 10], 2),
     # It is the incumbent's own, 1, where members diverged or were better: (1 + 1 + 7) / 3 = 3.
-    ([1, -INF, 7], [NAN, INF], [1, 1, 7], 3),
+    ([1, -INF, 7], [NAN, INF, -3e38], [1, 1, 7], 3),
     # One that no agent survived has no score, whatever the members did.
     ([NAN, INF, -INF], [1, 2], [NAN, INF, -INF], NAN),
 ])  # fmt: skip
