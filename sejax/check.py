@@ -130,8 +130,7 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
-    has_pool = hasattr(config.machines, "pool")
-    require(has_pool, "machines", "must have a pool of workers", use="ray")
+    require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
     others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
@@ -270,7 +269,8 @@ def _reported(
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"
     verdict = verdict_of(judgements.values())
-    verdict = verdict.replace("dynamics", "reward") if is_rn else verdict  # those of the task
+    if is_rn:  # its dynamics are the task's
+        verdict = verdict.replace("dynamics teach", "reward teaches")
     found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
     known = {name: x for name, x in found.items() if x}

@@ -219,7 +219,7 @@ def make_trainer(
     must = f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}"
     fix = "Set agent=sejax.make_agent(config, task) with that task."
     require(agent.spec.sizes in (None, sizes), "agent", f"{must}. {fix}")
-    fix = "Set varied=False; sejax.make_evaluator draws them."
+    fix = "Set agent=sejax.make_agent(config, task); sejax.make_evaluator draws them."
     require(agent.varied is None, "agent", "must have fixed hyperparameters here", fix=fix)
     require_part("training", TrainingConfig, training)
     require_modes()

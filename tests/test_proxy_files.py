@@ -341,7 +341,7 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
 def test_an_unknown_name_lists_the_shipped_ones(tmp_path, monkeypatch):
     error = refusal(sejax.load, "carpole")
     assert error.field == "source" and "Set source=cartpole." in str(error)
-    assert "=real?" not in str(refusal(sejax.load, "real"))  # a word of a command's
+    assert "=real." not in str(refusal(sejax.load, "real"))  # a word of a command's
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cartpole").mkdir()  # a folder without a proxy
     assert sejax.load("cartpole")

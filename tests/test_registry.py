@@ -232,7 +232,7 @@ def test_a_module_that_is_not_there_or_raises_is_one_message(module):
 
 @pytest.mark.parametrize(("typed", "meant"), [
     ("my_package.tasks.make", "env=my_package.tasks:make"), ("CartPole-v1", "env=cartpole_v1"),
-    ("my_tasks.py:make_long_pole", "env=my_tasks:make_long_pole"), ("CARTPOLE", "env=cartpole?"),
+    ("my_tasks.py:make_long_pole", "env=my_tasks:make_long_pole"), ("CARTPOLE", "env=cartpole."),
     ("examples/own_task.py:make", "env=examples.own_task:make"),
 ])  # fmt: skip
 def test_a_name_in_another_notation_is_answered_with_ours(typed, meant):

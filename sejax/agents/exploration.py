@@ -37,7 +37,7 @@ def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agen
     Its state holds the inner agent's state as `agent_state`. Its hyperparameters hold the inner
     agent's as `agent`.
     """
-    fix = "Set make_agent(config, task, exploration, varied=True)."
+    fix = "Call sejax.make_agent(config, task, exploration, varied=True)."
     require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
 
     def begin_episode(state: AgentState, episode: Array) -> AgentState:

@@ -76,7 +76,7 @@ class Mixture:
         is_weighted = min(self.weights, default=0) >= 0 and max(self.weights, default=0) > 0
         is_whole = is_weighted and len(self.names) == len(self.weights) == size
         must = "must have a name and a weight each, one above 0 and none below"
-        got = f"{size} agents, names={self.names} and weights={self.weights}"
+        got = f"{size} agents, weights={self.weights} and names={self.names}"
         require(is_whole, "agents", must, got=got, fix="Set names=() and weights=().")
 
     @classmethod

@@ -130,8 +130,8 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
         env = gymnasium.make(task, max_episode_steps=limit, disable_env_checker=True)
         task = RealTask.of_env(env)
     has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
-    must = f"must have the SE's actions, {learned.action_space}, and its step limit, {limit}"
-    got = f"{task.action_space} and {task.max_steps}"
+    must = f"must have the SE's step limit, {limit}, and its actions, {learned.action_space}"
+    got = f"{task.max_steps} and {task.action_space}"
     is_same = has_limit and task.action_space == learned.action_space
     require(is_same, "task", must, got=got, fix="Set max_steps, or wrap it in RescaleAction.")
     seen, known = task.observation_space, learned.observation_space

@@ -130,10 +130,11 @@ def configured(group: str, values: object, where: str) -> Any:
     if is_registered(group, values):
         return configure(group, values, ())  # type: ignore[arg-type]
     name = values.get("name") if isinstance(values, Mapping) else "none"
-    field, name = PLUGIN_ARGUMENTS.get(group, group), shortened(name, 40)
+    field, word = PLUGIN_ARGUMENTS.get(group, group), PLUGIN_WORDS.get(group, group)
     must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
-    fix = f"If you trust it, set {PLUGIN_WORDS.get(group, group)}={name}, in Python {field}=..."
-    raise ConfigError.of(field, must, got=name, fix=fix)
+    text = shortened(name, 80) if ":" in str(name) else "MODULE:NAME"
+    fix = f"If you trust it, set {word}={text} in a command, or {field}=... in Python."
+    raise ConfigError.of(field, must, got=shortened(name, 40), fix=fix)
 
 
 # --- where a file is ------------------------------------------------------------------------------
