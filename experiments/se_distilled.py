@@ -71,17 +71,17 @@ def compute(settings: SeDistilled) -> pd.DataFrame:
 
 def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
     """Rows of the command with one seed, a cached shard."""
-    own, config = distill.read(settings.words(seed))
-    config = dataclasses.replace(config, devices=settings.devices)
+    config = distill.read(settings.words(seed))
     folder = settings.work_folder / f"seed{seed}"
+    config = dataclasses.replace(config, devices=settings.devices, run_dir=str(folder))
 
     def run() -> pd.DataFrame:
         folder.mkdir(parents=True, exist_ok=True)
-        distill.distill(own, config, folder, shlex.join(settings.words(seed)))
+        distill.distill(config, shlex.join(settings.words(seed)))
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    return settings.shards.compute(f"seed{seed}", distill.settings_of(own, config), run)
+    return settings.shards.compute(f"seed{seed}", distill.settings_of(config), run)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -131,14 +131,14 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
             for x in mine.itertuples()
         }
         shown.append(costs | cells)
-    own, config = distill.read(settings.words(settings.seed))
-    search = own.search
+    config = distill.read(settings.words(settings.seed))
+    search = config.search
     note = (
         f"Each row is a run of `python -m sejax.distill`: {search.num_starts} searches begin with "
         f"{search.start_generations} generations each, the best goes on to generation "
-        f"{search.generations}; students train on SEs of {own.num_snapshots} policies, and one SE "
-        "is kept. Costs are those of the whole run. A kind's column: mean, standard deviation and "
-        f"worst of {settings.num_tested} students that took no part in choosing, each after "
+        f"{search.generations}; students train on SEs of {config.num_snapshots} policies, and one "
+        "SE is kept. Costs are those of the whole run. A kind's column: mean, standard deviation "
+        f"and worst of {settings.num_tested} students that took no part in choosing, each after "
         f"{config.training.max_steps:,} steps on the SE."
     )
     title = f"SEs of {settings.env} made of a searched policy"

@@ -12,7 +12,6 @@ of sejax.run with preset=distilled. Writes proxy.safetensors, card.md, students.
 into run_dir. The same command resumes where it stopped.
 """
 
-import dataclasses
 import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -22,12 +21,13 @@ from typing import Any
 import jax
 import pandas as pd
 
+from sejax import envs
 from sejax.distillation.policies import CopyConfig, copied
 from sejax.distillation.policy_search import SearchConfig, searched
 from sejax.distillation.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import ConfigError, Count, Options, field_lines, require, shortened
-from sejax.options.plain import flatten, from_plain, merge, to_plain
+from sejax.options import Count, field_lines, option, require, shortened
+from sejax.options.plain import fields_of, flatten, merge
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -47,8 +47,8 @@ CHOOSE, TEST = "choose", "test"  # what students are for
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillConfig(Options):
-    """The fields of `python -m sejax.distill`; all others are those of `sejax.run`.
+class DistillConfig(LearnConfig):
+    """Task, students and their trainings, as in a run, and how policies become SEs.
 
     Attributes:
       policy: ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax,
@@ -63,13 +63,42 @@ class DistillConfig(Options):
       num_tested: Further students of each agent, on the chosen SE.
     """
 
-    policy: str | None = None
-    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
-    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
+    policy: str | None = option(None, names_code=True)
+    copy: CopyConfig = CopyConfig()
+    search: SearchConfig = SearchConfig()
     independent_starts: bool = False
     num_snapshots: Count = 6
     num_students: Count = 4
     num_tested: Count = 10
+
+    @classmethod
+    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+        """The preset, which is `distilled`, and what depends on the task.
+
+        One-step SEs have trainings and students of their own. Searches leave out the task's reward
+        for being healthy.
+        """
+        env = configuration.env_in(typed.get("env", {}), imports)
+        actions = envs.spec_of(env).actions
+        if not compose.names_of(typed["agents"]):
+            students = {name: {"name": name} for name in STUDENTS[actions]}
+            typed = merge(typed, {"agents": students})
+        # An episode of a one-step SE has one step.
+        steps = flatten(typed).get("training.max_steps", STEPS[actions])
+        lengths = {"max_steps": steps, "max_episodes": steps}
+        search = {"alive_bonus": getattr(env, "healthy_reward", 0.0)}
+        below = super().layers_below({"preset": "distilled"} | typed, imports)
+        return below | {"distill": {"training": lengths, "search": search}}
+
+    @property
+    def resolved_run_dir(self) -> Path:
+        """The command's folder: `run_dir`, or one named by task, given policy and seed."""
+        algorithm, _, path = (self.policy or "").rpartition(":")
+        parts = ["distill", self.name("env"), algorithm, Path(path).stem, f"s{self.seed}"]
+        return Path(self.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
+
+
+OWN = fields_of(DistillConfig).keys() - fields_of(LearnConfig).keys()
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -79,75 +108,46 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    job, config = read(overrides)
+    config = read(overrides)
     runtime.configure_jax()
-    folder = folder_of(job, config)
     try:
-        distill(job, config, folder, shlex.join(overrides))
+        distill(config, shlex.join(overrides))
     except KeyboardInterrupt as stop:
-        commands.interrupted(f"Interrupted. The same command resumes from {folder}.", stop)
+        message = f"Interrupted. The same command resumes from {config.resolved_run_dir}."
+        commands.interrupted(message, stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
+    plain = flatten(read(overrides).plain())
+    values = {name: x for name, x in plain.items() if name.partition(".")[0] in OWN}
     classes = [("", DistillConfig), ("copy", CopyConfig), ("search", SearchConfig)]
-    lines = field_lines(flatten(to_plain(DistillConfig())), classes, {})
-    return f"{__doc__}\nIts own fields, with their defaults:\n{lines}"
+    return f"{__doc__}\nIts own fields, with their values:\n{field_lines(values, classes, {})}"
 
 
-class StudentsConfig(LearnConfig):
-    """Task, students and their trainings, with defaults for one-step SEs of a policy."""
-
-    @classmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
-        """The preset, which is `distilled`, and lengths of trainings and students for the task."""
-        actions = configuration.spec_in(typed.get("env", {}), imports).actions
-        if not compose.names_of(typed["agents"]):
-            students = {name: {"name": name} for name in STUDENTS[actions]}
-            typed = merge(typed, {"agents": students})
-        # An episode of a one-step SE has one step.
-        steps = flatten(typed).get("training.max_steps", STEPS[actions])
-        lengths = {"training": {"max_steps": steps, "max_episodes": steps}}
-        below = super().layers_below({"preset": "distilled"} | typed, imports)
-        return below | {"distill": lengths}
-
-
-def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
-    """The command's fields, and a configuration of task, students and trainings.
+def read(overrides: Sequence[str]) -> DistillConfig:
+    """The configuration of task, students and trainings.
 
     Raises:
       ConfigError: for invalid overrides.
     """
-    values, texts = compose.partition(overrides, DistillConfig)
-    for name in [name for name in texts if name.partition(".")[0] not in USED]:
+    for name in compose.words(overrides):
+        is_used = name.partition(".")[0] in {*USED, *OWN}
         fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-        must = "must be left out, as it has no effect here"
-        raise ConfigError.of(shortened(name, 40), must, fix=fix)
-    words = [f"{name}={text}" for name, text in texts.items()]
-    config = configuration.config(words, StudentsConfig)
+        require(is_used, shortened(name, 40), "has no effect here", fix=fix)
+    config: DistillConfig = configuration.config(overrides, DistillConfig)
     require(config.agent_hparams == "default", "agent_hparams", "has no effect here. Leave it out.")
-    # The task's reward for being healthy is left out of searches.
-    bonus = {"search": {"alive_bonus": getattr(config.env, "healthy_reward", 0.0)}}
-    return from_plain(DistillConfig, merge(bonus, values), ""), config
-
-
-def folder_of(job: DistillConfig, config: LearnConfig) -> Path:
-    """The command's folder: `run_dir`, or one named by task, given policy and seed."""
-    algorithm, _, path = (job.policy or "").rpartition(":")
-    parts = ["distill", config.name("env"), algorithm, Path(path).stem, f"s{config.seed}"]
-    return Path(config.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
+    return config
 
 
 # --- what the command does ------------------------------------------------------------------------
 
 
-def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
+def distill(config: DistillConfig, words: str = "") -> Path:
     """Finds policies, makes SEs of them, and writes the SE that teaches best.
 
     Args:
-      job: how policies are found, and how many students there are.
-      config: task, students and their trainings, and seed.
-      folder: where files are written; finished parts found there are not repeated.
+      config: the configuration; finished parts that its folder holds are not repeated.
       words: the command's overrides, for the card.
 
     Returns:
@@ -157,39 +157,40 @@ def distill(job: DistillConfig, config: LearnConfig, folder: Path, words: str = 
       ConfigError: for a folder of another command, or an invalid policy.
       OSError: if a file cannot be written.
     """
-    with Store(folder, settings_of(job, config)) as store:
+    with Store(config.resolved_run_dir, settings_of(config)) as store:
         store.get(CHECKPOINT)  # raises for a folder of another command
-        return _distilled(job, config, store, words)
+        return _distilled(config, store, words)
 
 
-def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str) -> Path:
+def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     task, folder = config.task(), store.folder
     # The last key also tests policies. The unused key "nothing" keeps the numbers of old runs.
     uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
-    if job.policy is None:
-        lessons, costs = searched(job.search, task, job.num_snapshots, keys, store, config.devices)
+    if config.policy is None:
+        shared = config.num_snapshots, keys, store, config.devices
+        lessons, costs = searched(config.search, task, *shared)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
-        lessons, costs = copied(job.copy, task, job.policy, keys, store)
+        lessons, costs = copied(config.copy, task, config.policy, keys, store)
     store.put(CHECKPOINT)
-    ses = [make_exact(task, x.layers, x.states, job.independent_starts) for x in lessons]
+    ses = [make_exact(task, x.layers, x.states, config.independent_starts) for x in lessons]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:
-        student_keys = jax.random.split(keys[CHOOSE], job.num_students)
+        student_keys = jax.random.split(keys[CHOOSE], config.num_students)
         rows = students(ses, lessons, config, student_keys, store)
         rows["use"], marks = CHOOSE, grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
     se, lesson = ses[best], lessons[best]
-    student_keys = jax.random.split(keys[TEST], job.num_tested)
+    student_keys = jax.random.split(keys[TEST], config.num_tested)
     tested = students([se], [lesson], config, student_keys, store)
     rows = pd.concat([rows, tested.assign(use=TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     spent = pd.concat([costs, rows])[["real_steps", "cpu_s"]].sum()
     learning = {
         "command": f"python -m sejax.distill {words}".rstrip(),
-        "generations": int(costs["generation"].max()) if job.policy is None else 0,
+        "generations": int(costs["generation"].max()) if config.policy is None else 0,
         "real_steps": int(spent["real_steps"]),
         "agents": len(rows),
         "train_steps": int(rows["train_steps"].sum()),
@@ -197,18 +198,17 @@ def _distilled(job: DistillConfig, config: LearnConfig, store: Store, words: str
     }
     record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
     record |= {"learning": learning, "policy_return": lesson.policy_return}
-    path, plain = folder / "proxy.safetensors", config.plain()
-    learned_with = {name: value for name, value in plain.items() if name not in ("env", "proxy")}
+    path, not_learned_with = folder / "proxy.safetensors", {"env", "proxy", *OWN}
+    learned_with = {k: x for k, x in config.plain().items() if k not in not_learned_with}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path), str(folder)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
 
 
-def settings_of(job: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+def settings_of(config: DistillConfig) -> dict[str, Any]:
     """The settings that the results depend on, as plain values."""
-    plain = config.plain()
-    return to_plain(job) | {k: v for k, v in plain.items() if k not in ("run_dir", "devices")}
+    return {k: x for k, x in config.plain().items() if k not in ("run_dir", "devices")}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from support import ended, evaluation, printed, refusal
 import sejax
 from sejax import distill, evaluate, run
 from sejax.agents.mixture import MixtureConfig
-from sejax.distill import DistillConfig
+from sejax.distillation.policies import CopyConfig
 from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
@@ -317,7 +317,7 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
     (run, ["agents=[ddqn,ppo]"], LearnConfig, ["mixture.weights.ddqn=1.0  # share"]),
     (run, ["preset=paper", "seed=3,4"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
     (evaluate, ["proxy=cartpole"], EvaluateConfig, ["agents.ppo.epochs=10  # passes", "(proxy)"]),
-    (distill, [], DistillConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
+    (distill, [], CopyConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
 ])  # fmt: skip
 def test_help_shows_each_field_with_its_value_and_text(module, words, schema, expected):
     said = module.help_text(words)

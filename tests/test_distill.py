@@ -12,7 +12,7 @@ import pytest
 from support import refused
 
 import sejax
-from sejax.distill import evaluations_of, folder_of, main, read
+from sejax.distill import evaluations_of, main, read
 from sejax.distillation import policies, teaching
 from sejax.proxies import header, zoo
 
@@ -177,7 +177,7 @@ def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
 
 def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
     (file := tmp_path / "x.yaml").write_text("{env: pendulum, agent: ppo, training.max_steps: 777}")
-    config = read([f"preset={file}"])[1]
+    config = read([f"preset={file}"])
     assert (*config.agents, config.training.max_steps) == ("ppo", 777)
     assert (config.preset, config.agent.rollout_steps) == ("distilled", 256)
     file.write_text("{env: pendulum, agent_hparams: varied}")  # which students have not
@@ -185,11 +185,11 @@ def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
 
 
 def test_defaults_are_those_of_the_task():
-    own, config = read(["env=hopper"])
-    assert own.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
-    assert read(["env=hopper", "search.alive_bonus=0"])[0].search.alive_bonus == 0.0
-    assert read(["env=halfcheetah"])[0].search.alive_bonus == 0.0
-    config = read(["env=cartpole", "training.max_steps=700"])[1]
+    config = read(["env=hopper"])
+    assert config.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
+    assert read(["env=hopper", "search.alive_bonus=0"]).search.alive_bonus == 0.0
+    assert read(["env=halfcheetah"]).search.alive_bonus == 0.0
+    config = read(["env=cartpole", "training.max_steps=700"])
     assert config.training.max_episodes == 700 and list(config.agents) == ["ddqn", "ppo"]
 
 
@@ -199,4 +199,4 @@ def test_defaults_are_those_of_the_task():
     (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
 ])  # fmt: skip
 def test_the_default_folder_tells_policies_apart(words, name):
-    assert folder_of(*read(["env=cartpole", *words])).name == name
+    assert read(["env=cartpole", *words]).resolved_run_dir.name == name

@@ -317,18 +317,17 @@ def layers_of(command: type[CommandConfig], overrides: Sequence[str]) -> dict[st
 def default_agent(env: Tree, imports: Collection[str]) -> str:
     """The default agent of a task, of which plain values are given."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
-        return agents.default_for(spec_in(env, imports))
+        return agents.default_for(envs.spec_of(env_in(env, imports)))
     return agents.DEFAULTS[0]
 
 
-def spec_in(env: Tree, imports: Collection[str]) -> TaskSpec:
-    """The spec of a task, of which plain values are given.
+def env_in(env: Tree, imports: Collection[str]) -> Any:
+    """The configuration of a task, of which plain values are given.
 
     Raises:
       ConfigError: if they describe no task that may be made.
     """
-    env = {"name": compose.choice(env, "env")} | env
-    return envs.spec_of(configure("env", env, imports))
+    return configure("env", {"name": compose.choice(env, "env")} | env, imports)
 
 
 def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
