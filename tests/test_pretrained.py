@@ -50,8 +50,8 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     proxy, stored = PROXIES[name], sejax.load_proxy(name)
     words = shlex.split(proxy.learning.command)[3:]
     if proxy.policy_return is not None:
-        own, config = read(words)
-        assert own.search.generations == proxy.learning.generations
+        config = read(words)
+        assert config.search.generations == proxy.learning.generations
         assert [x.agent for x in proxy.on_proxy] == list(stored.learned_agents())
     else:
         config = sejax.config(words)
