@@ -54,7 +54,7 @@ def test_a_members_score_is_not_finite_if_one_evaluation_is_not(aggregate, expec
     # It is the incumbent's own, 1, where members diverged or were better: (1 + 1 + 7) / 3 = 3.
     ([1, -INF, 7], [NAN, INF, -3e38], [1, 1, 7], 3),
     # One that no agent survived has no score, whatever the members did.
-    ([NAN, INF, -INF], [1, 2], [NAN, INF, -INF], NAN),
+    ([NAN, INF, 2.0**127], [1, 2], [NAN, INF, 2.0**127], NAN),
 ])  # fmt: skip
 def test_the_incumbents_agents_that_diverged_get_the_lowest_score(scores, members, repaired, mean):
     result = Evaluations().incumbent_scores(jnp.float32(scores), jnp.float32(members))

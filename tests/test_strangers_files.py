@@ -114,7 +114,8 @@ PRESETS = [
     {"agents": ["ddqn", "ppo"], "agents.ddqn.name": IMPORTED},
     {"agents": {"ppo": {"name": IMPORTED}}},
     {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
-    {"es.score_transform": IMPORTED}, {"tracker": IMPORTED},
+    {"es.score_transform": IMPORTED}, {"tracker": IMPORTED}, {"policy": IMPORTED},
+    {"es.score_transform": IMPORTED.encode()}, {"policy": IMPORTED.encode()},  # !!binary
 ]  # fmt: skip
 
 

@@ -74,7 +74,7 @@ class Evaluations:
         lowest = jnp.nanmin(jnp.where(jnp.abs(all_scores) <= MOST, all_scores, jnp.nan))
         finite = jnp.abs(scores) <= MOST
         repaired = jnp.where(~finite & finite.any(), lowest, scores)
-        return repaired, finite_mean(repaired)
+        return repaired, finite_mean(jnp.where(jnp.abs(repaired) <= MOST, repaired, jnp.nan))
 
 
 @dataclass(frozen=True, kw_only=True)

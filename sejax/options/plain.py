@@ -124,7 +124,7 @@ def from_plain(
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
         of_field = marks(cls, name)
-        if isinstance(value, str) and ":" in value and of_field.get("names_code"):
+        if isinstance(value, str | bytes) and ":" in str(value) and of_field.get("names_code"):
             registry.require_typed(full[name], str(value), imports)
         how = defaults[name], imports, of_field.get("plugin")
         fields[name] = _read(value, hints[name], full[name], *how)
