@@ -37,7 +37,7 @@ from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypedDict, Unpack
 
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
@@ -46,6 +46,20 @@ MOST, LEAST = 1e30, 1e-30  # of numbers in programs, which compute in 32 bits
 
 
 # --- errors --------------------------------------------------------------------------------------
+
+
+class Parts(TypedDict, total=False):
+    """What follows a rule in a message.
+
+    Attributes:
+      got: the value, which the message shortens.
+      use: a value that holds, for `Set FIELD=VALUE.`
+      fix: another sentence that says how to fix it.
+    """
+
+    got: object
+    use: object
+    fix: str
 
 
 class ConfigError(ValueError):
@@ -60,14 +74,12 @@ class ConfigError(ValueError):
         self.field = field
 
     @classmethod
-    def of(
-        cls, field: str, message: str, *, got: object = ..., use: object = ..., fix: str = ""
-    ) -> Self:
+    def of(cls, field: str, message: str, **parts: Unpack[Parts]) -> Self:
         """The error that `require` raises with these arguments."""
-        value = "" if got is ... else f"; got {shortened(got)}"
-        fix = fix if use is ... else f"Set {field}={use}."
-        end = f". {fix}".rstrip() if value or fix else ""
-        return cls(f"{field} {message}{value}{end}", field)
+        got = f"; got {shortened(parts['got'])}" if "got" in parts else ""
+        fix = f"Set {field}={parts['use']}." if "use" in parts else parts.get("fix", "")
+        end = f". {fix}".rstrip() if parts else ""
+        return cls(f"{field} {message}{got}{end}", field)
 
 
 class FailedError(RuntimeError):
@@ -87,18 +99,14 @@ def errors_of(group: str, where: str) -> Iterator[None]:
         raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
 
 
-def require(
-    holds: object, field: str, message: str, *, got: object = ..., use: object = ..., fix: str = ""
-) -> None:
+def require(holds: object, field: str, message: str, **parts: Unpack[Parts]) -> None:
     """Raises `ConfigError` unless `holds`.
 
     Args:
       holds: what must be true.
       field: the field at fault.
-      message: the rule; with none of the following the whole message, to its full stop.
-      got: the value, which the message shortens.
-      use: a value that holds, for `Set FIELD=VALUE.`
-      fix: another sentence that says how to fix it.
+      message: the rule; without parts the whole message, to its full stop.
+      **parts: `got`, the value; and `use`, a value that holds, or `fix`, a sentence. See `Parts`.
 
     Example:
       >>> require(0 % 2, "es.population_size", "must be odd", got=0, use=1)
@@ -106,7 +114,7 @@ def require(
       sejax.options.ConfigError: es.population_size must be odd; got 0. Set es.population_size=1.
     """
     if not holds:
-        raise ConfigError.of(field, message, got=got, use=use, fix=fix)
+        raise ConfigError.of(field, message, **parts)
 
 
 def require_package(field: str, package: str, extra: str) -> None:

@@ -25,9 +25,9 @@ _ADDRESS = re.compile(
 )
 
 
-def is_address(source: object) -> bool:
+def is_address(source: str) -> bool:
     """Whether a source is an address on the Hub."""
-    return str(source).startswith(SCHEME)
+    return source.startswith(SCHEME)
 
 
 def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
