@@ -268,14 +268,13 @@ def _reported(
     if cost:  # "never" if agents trained on the proxy do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"
-    verdict = verdict_of(judgements.values())
-    if is_rn:  # its dynamics are the task's
-        verdict = verdict.replace("dynamics teach", "reward teaches")
+    teaches = "its reward teaches" if is_rn else "its dynamics teach"  # an RN's are the task's
+    verdict = verdict_of(judgements.values(), teaches)
     found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
-    known = {name: x for name, x in found.items() if x}
+    printed = {name: x for name, x in found.items() if x}
     shown = summary.set_index(solved[summary.index], append=True)
-    print_table(shown, title, yaml.safe_dump(known, sort_keys=False).strip(), SHOWN)
+    print_table(shown, title, yaml.safe_dump(printed, sort_keys=False).strip(), SHOWN)
     found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
     found["worlds"] = summary.assign(solved=solved).to_dict("index")
     write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")

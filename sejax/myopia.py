@@ -88,11 +88,12 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     return Judgement(verdict, float(lost.mean()), low, high, max(1, missing))
 
 
-def verdict_of(judgements: Collection[Judgement]) -> str:
+def verdict_of(judgements: Collection[Judgement], teaches: str = "its dynamics teach") -> str:
     """The verdict on a proxy, in words, from a judgement for each algorithm it was learned with.
 
     If one algorithm learns as much without looking ahead, the rewards hold a policy. The dynamics
-    teach if every algorithm that learns must look ahead.
+    teach if every algorithm that learns must look ahead; `teaches` says so, and of an RN that its
+    reward does.
     """
     verdicts = {judgement.verdict for judgement in judgements}
     if "policy" in verdicts:
@@ -100,4 +101,4 @@ def verdict_of(judgements: Collection[Judgement]) -> str:
     if "open" in verdicts:
         missing = max(x.missing for x in judgements if x.verdict == "open")
         return f"undecided: {missing:,} more agents"
-    return "its dynamics teach" if "dynamics" in verdicts else "teaches little"
+    return teaches if "dynamics" in verdicts else "teaches little"
