@@ -82,10 +82,6 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert refused(sejax.training_of, proxy) == "training"
     sejax.save(path, env, weights[1], {"training": {"max_steps": 7}}, 0.7)  # with today's defaults
     assert not sejax.training_of(sejax.load_proxy(path)).time_limit_is_terminal
-    tensors, header = unpack(path.read_bytes(), "sejax")
-    del header["config"]["training"]["time_limit_is_terminal"]  # as in older files
-    path.write_bytes(pack(tensors, "sejax", header))
-    assert sejax.training_of(sejax.load_proxy(path)).time_limit_is_terminal
 
 
 def test_a_set_comes_back_and_parts_of_it_are_chosen_by_score_and_place(tmp_path, env, weights):

@@ -9,8 +9,6 @@ from sejax.options import registry
 GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
 GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
 GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
-# Fields of a training that older files lack, with the defaults of that time.
-TRAINING = {"time_limit_is_terminal": True}
 
 
 def of_today(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -30,10 +28,3 @@ def of_today(config: Mapping[str, Any]) -> dict[str, Any]:
             new["mixture"] = of_all | {"weights": weights}
         new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
     return new
-
-
-def file_of_today(config: Mapping[str, Any]) -> dict[str, Any]:
-    """As `of_today`, with the fields of the training that a file lacks."""
-    training = config.get("training")
-    full = {"training": {**TRAINING, **training}} if isinstance(training, Mapping) else {}
-    return of_today(config) | full

@@ -57,7 +57,7 @@ class Header:
     proxies: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        config = old.file_of_today(self.config)
+        config = old.of_today(self.config)
         object.__setattr__(self, "config", config)
         agents = dict(config["agents"]).values()
         parts = [config["env"], config["proxy"], *agents, *self.proxies]

@@ -373,4 +373,4 @@ def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    return LearnConfig.of_tree(old.file_of_today(values), imports)
+    return LearnConfig.of_tree(old.of_today(values), imports)
