@@ -1,9 +1,7 @@
 """How every test runs: two CPU devices, warnings as errors, compiled programs kept between runs."""
 
 import gc
-import hashlib
 import os
-import platform
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,23 +26,10 @@ import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from sejax.runs.runtime import cpu_name  # noqa: E402
 
-def _cpu_model() -> str:
-    """Model and instruction sets: a program compiled for one CPU may crash on another."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    wanted = ("model name", "flags", "Features", "CPU part")
-    return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
-
-
-def _compilation_cache() -> Path:
-    base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "sejax-tests" / hashlib.sha256(_cpu_model().encode()).hexdigest()[:16]
-
-
-jax.config.update("jax_compilation_cache_dir", str(_compilation_cache()))
+_CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "sejax-tests", cpu_name())
+jax.config.update("jax_compilation_cache_dir", str(_CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 

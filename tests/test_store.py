@@ -67,11 +67,9 @@ def test_every_flipped_bit_and_lost_byte_is_noticed():
             unpack(damaged, "note")
 
 
-def test_a_damaged_entry_a_folder_or_a_sparse_file_of_30_gb_is_refused(folder):
+def test_a_damaged_entry_or_a_folder_is_refused(folder):
     path, store = folder / "rounds.safetensors", Store(folder, SETTINGS)
     path.write_bytes(path.read_bytes()[:-1])
-    assert refused(store.get, "rounds") == "run_dir"
-    os.truncate(path, 30 << 30)
     assert refused(store.get, "rounds") == "run_dir"
     path.unlink()
     path.mkdir()

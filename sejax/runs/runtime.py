@@ -70,9 +70,8 @@ def configure_jax() -> None:
     Matrices are multiplied in single precision on GPUs too, as on CPUs and in `sejax.gym`. By
     default recent GPUs round factors to ten bits, which makes a proxy another one there.
 
-    Compiled programs are kept between runs. Code compiled for another kind of CPU is rejected or
-    unsafe, so the folder's name depends on the CPU's model and features. `SEJAX_CACHE_DIR` moves
-    the folder; set to nothing, it switches the cache off.
+    Compiled programs are kept between runs, in a folder for this kind of CPU. `SEJAX_CACHE_DIR`
+    moves the folder; set to nothing, it switches the cache off.
 
     Raises:
       ConfigError: if jax computes in 64 bits.
@@ -83,15 +82,19 @@ def configure_jax() -> None:
     root = files.cache_folder()
     if root is None or jax.config.jax_compilation_cache_dir:
         return
+    jax.config.update("jax_compilation_cache_dir", str(root / cpu_name()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cpu_name() -> str:
+    """A name of this kind of CPU: code compiled for another kind is rejected or unsafe."""
     lines = [platform.processor()]
     with contextlib.suppress(OSError):
         of_cores = Path("/proc/cpuinfo").read_text().splitlines()
-        fields = ("model name", "flags", "Features")
+        fields = ("model name", "flags", "Features", "CPU part")
         lines = sorted({x for x in of_cores if x.startswith(fields)}) or lines
     digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
-    folder = str(root / f"{platform.machine()}-{digest}")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    return f"{platform.machine()}-{digest}"
 
 
 def versions() -> dict[str, str]:
