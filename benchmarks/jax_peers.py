@@ -176,8 +176,7 @@ def sejax_trainer(algorithm: str, width: int, task_name: str, world: str, steps:
         config: Any = sejax.PPOConfig(**network, **rollouts, activation="tanh")
     else:
         network |= {"batch_size": 64, "buffer_size": steps, "warmup_episodes": 0}
-        make = {"ddqn": sejax.DDQNConfig, "sac": sejax.SACConfig, "td3": sejax.TD3Config}[algorithm]
-        config = make(**network, activation="relu")
+        config = getattr(sejax, f"{algorithm.upper()}Config")(**network, activation="relu")
     agent = sejax.make_agent(config, task)
     training = sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
     train = sejax.make_trainer(agent, env, training)

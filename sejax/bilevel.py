@@ -245,9 +245,13 @@ def make_bilevel(
     require(proxy.task is task, "proxy", must)
     objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
-    num_dims = sum(x.size for x in jax.tree.leaves(shapes))
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-    strategy = make("es", es, num_dims)
+    mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
+    strategy = make("es", es, mean.size)
+    asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
+    size, must = strategy.population_size, "must ask for population_size vectors, in pairs if"
+    is_whole = asked.shape == (size, mean.size) and not (strategy.antithetic and size % 2)
+    got = f"{asked.shape}, population_size={size}, antithetic={strategy.antithetic}"
+    require(is_whole, "es", f"{must} antithetic, of {mean.size} numbers", got=got)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,

@@ -38,7 +38,7 @@ from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import ENOUGH, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import LARGEST, Count, as_text, registry, require
+from sejax.options import LARGEST, Count, as_text, errors_of, registry, require
 from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -130,10 +130,12 @@ def run(config: CheckConfig) -> dict[str, Any]:
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     see = all(hasattr(agent, "discount") for agent in learned.values())
     require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
+    zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
     require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
-    others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
+    with errors_of("agent", "algorithms"):
+        others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
     myopic = dict[str, dict[str, AgentConfig]]()
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
     students = learned | others

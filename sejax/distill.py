@@ -158,7 +158,9 @@ def distill(config: DistillConfig, words: str = "") -> Path:
       OSError: if a file cannot be written.
     """
     with Store(config.resolved_run_dir, settings_of(config)) as store:
-        store.get(CHECKPOINT)  # raises for a folder of another command
+        is_new = store.get(CHECKPOINT) is None  # raises for a folder of another command
+        if is_new and (store.folder / "proxy.safetensors").exists():
+            raise store.refused(f"must hold no SE of another command; got {store.folder}")
         return _distilled(config, store, words)
 
 

@@ -111,21 +111,23 @@ class EvaluateConfig(CommandConfig):
         fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
         require("proxy" in typed, "proxy", f"must be given. {fix}")
         names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
-        is_clear = not names or hparams != "as_learned" or typed["proxy"] == "real"
-        must = f"must be left out with agent_hparams=as_learned; got {', '.join(names)}"
-        require(is_clear, "agents", f"{must}. Set agent_hparams=default.")
-        is_learned = not names and hparams in (None, "as_learned")
+        is_learned = hparams == "as_learned" or (not names and hparams is None)
         stored, learned, default = None, Tree(), ""
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
                 default = agents.default_for(stored.spec)
         if stored:
+            are_same = names in ({}, compose.names_of(stored.config["agents"]))
+            must = f"must be the proxy's with agent_hparams=as_learned; got {', '.join(names)}"
+            is_clear = are_same or hparams != "as_learned"
+            require(is_clear, "agents", f"{must}. Set agent_hparams=default.")
             learned = agents_in(stored.config, imports, is_learned)
             must = "must be left out for a proxy whose file has no agents"
             require(learned or hparams != "as_learned", "agent_hparams", f"{must}.")
         if learned and is_learned:
-            if "name" in typed.get("exploration", {}):
+            stored_name = learned["exploration"]["name"]
+            if typed.get("exploration", {}).get("name", stored_name) != stored_name:
                 del learned["exploration"]
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
         default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)

@@ -226,7 +226,11 @@ def make_trainer(
     if training.num_tests_between and test_fn is None:
         number = training.num_tests_between
         raise ValueError(f"training.num_tests_between={number} needs a test_fn; got None.")
-    train = _Loop(agent, env, training, solved_reward, test_fn, keeps_stored).train
+    test_fn = test_fn if training.num_tests_between else None
+    if test_fn is None and (proxy := proxy_in(env)) is not None:  # tests may end a curve
+        require_reachable("training", training, proxy.max_steps)
+    world = repeat_actions(env, agent.spec.action_repeat)
+    train = _Loop(agent, world, training, solved_reward, test_fn, keeps_stored).train
     if in_batches:
         train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
     return lambda key, env_params, hparams=None, active=True: train(
@@ -247,6 +251,7 @@ def num_parallel_on_cpu(
     return min(width, cpu.width_of(num_agents))
 
 
+@dataclass(frozen=True)
 class _Loop:
     """The step loop of one agent in one world; pure functions of its carry.
 
@@ -267,34 +272,23 @@ class _Loop:
     `rollout` itself) keeps its `state` by a select.
     """
 
-    def __init__(
-        self,
-        agent: Agent,
-        env: Environment,
-        training: TrainingConfig,
-        solved_reward: float,
-        test_fn: TestFn | None,
-        keeps_stored: bool,
-    ):
-        limit_is_terminal = training.time_limit_is_terminal and is_real(env)
-        self.agent, self.training, self.solved_reward = agent, training, solved_reward
-        self.keeps_stored = keeps_stored
-        self.limit_is_terminal = limit_is_terminal
-        self.test_fn = test_fn if training.num_tests_between else None
-        self.env = repeat_actions(env, agent.spec.action_repeat)
-        self.max_steps = self.buffer_steps = training.max_steps or LARGEST
-        self.prepare = lambda params, hparams: params
-        if (proxy := proxy_in(env)) is not None:
-            if self.test_fn is None:  # a curve of tests may end at either limit
-                require_reachable("training", training, proxy.max_steps)
-            self.buffer_steps = min(self.max_steps, training.max_episodes * proxy.max_steps)
-            self.prepare = lambda params, hparams: proxy.prepare(
-                params, agent.discount(hparams), limit_is_terminal
-            )
+    agent: Agent
+    env: Environment  # whose steps are the agent's
+    training: TrainingConfig
+    solved_reward: float
+    test_fn: TestFn | None
+    keeps_stored: bool
+
+    @property
+    def limit_is_terminal(self) -> bool:
+        """Whether targets do not bootstrap at a time limit."""
+        return self.training.time_limit_is_terminal and is_real(self.env)
 
     def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
         """One training."""
-        env_params = self.prepare(env_params, hparams)
+        if (proxy := proxy_in(self.env)) is not None:
+            discount = self.agent.discount(hparams)
+            env_params = proxy.prepare(env_params, discount, self.limit_is_terminal)
         key_begin, key_steps = jax.random.split(key)
         state = self.begin(key_begin, env_params, hparams, active)
         buffer = self.buffer(state)
@@ -346,7 +340,10 @@ class _Loop:
             action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
-        return self.agent.buffer(jax.eval_shape(example), self.buffer_steps)
+        num_steps = self.training.max_steps or LARGEST
+        if (proxy := proxy_in(self.env)) is not None:
+            num_steps = min(num_steps, self.training.max_episodes * proxy.max_steps)
+        return self.agent.buffer(jax.eval_shape(example), num_steps)
 
     def rollout(
         self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
@@ -423,7 +420,7 @@ class _Loop:
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=nonfinite,
-            active=state.active & (train_steps < self.max_steps),
+            active=state.active & (train_steps < (self.training.max_steps or LARGEST)),
         )
         before = state
         state = jax.lax.cond(

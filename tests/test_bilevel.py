@@ -234,6 +234,8 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
 def test_what_no_learner_can_be_made_of_is_refused(part, value):
     parts = tiny(words=ROOM).parts()
     assert refused(make_learner, **parts | {part: value}) == part
+    strategy = dataclasses.replace(sejax.NESConfig(population_size=4).make(138), population_size=6)
+    assert refused(make_learner, **parts | {"es": strategy}) == "es"
 
 
 @pytest.mark.parametrize(("words", "overrides"), [

@@ -103,6 +103,8 @@ def test_damaged_files_and_runs_of_another_command_are_refused(copied):
     words = [*QUICK, f"run_dir={copied}"]
     os.truncate(next(copied.glob("search/*")), 200)
     assert refused(main, words) == "run_dir"
+    (copied / "checkpoint.safetensors").unlink()
+    assert refused(main, words) == "run_dir"  # it holds an SE
     (copied / "checkpoint.safetensors").write_bytes(b"")
     assert refused(main, words) == "run_dir"
 

@@ -176,13 +176,16 @@ def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, 
 
 def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     """An RN learned with Q-learning agents and a count-based bonus."""
-    words = "env=cliff_walking", "proxy=rn", "exploration=count_based"
+    words = "env=cliff_walking", "proxy=rn", "exploration=count_based", "exploration.count_power=2"
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     (worlds, _), learner = setup_of(config), learned(*words)[0]
     assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
     assert worlds["the proxy"].trainings == {"q_learning": config.real_training}
+    for typed in ("agent=q_learning", "exploration=count_based", "exploration.reward_scale=0.1"):
+        words = f"proxy={path}", "agent_hparams=as_learned", typed
+        assert evaluate_config(*words).exploration == config.exploration
 
 
 def test_agents_that_are_named_have_the_hyperparameters_of_the_run(tmp_path, monkeypatch):

@@ -69,6 +69,8 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
     (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
     (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
     (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
+    (lambda: mixture(2, weights=(1.0, NAN)), "agents"),
+    (lambda: Mixture(agents=(AGENTS[0], "sarsa")), "agent"),
     (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
     (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
     (lambda: MixtureConfig(aggregate="max"), "mixture.aggregate"),

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -218,6 +219,15 @@ def test_step_size_and_decay_of_the_noise_reach_an_algorithm():
     np.testing.assert_allclose(np.abs(mean), 0.02, rtol=1e-2)  # Adam's first step
     members, _ = strategy.ask(jax.random.key(1), state)
     assert float(jnp.std(members - mean)) == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_scores_that_are_all_equal_change_nothing(name):
+    strategy, key = evosax_strategy(name), jax.random.key(0)
+    members, state = strategy.ask(key, strategy.init(key, jnp.ones(DIMS)))
+    for score in (7.0, NAN):
+        told = strategy.tell(key, members, jnp.full(16, score), jnp.float32(score), state)
+        chex.assert_trees_all_equal(told, state)
 
 
 def another_of_evosax(num_dims):

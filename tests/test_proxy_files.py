@@ -227,6 +227,10 @@ def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights,
     given = {"env": env, "weights": weights[1], "discount": 0.7} | given
     assert refused(sejax.save, path, **given) == field
     assert refused(sejax.save_set, path, env, weights[:2], [{}], discount=0.7) == "weights"
+    records = [{}, {}]
+    for others in ({"potential": {}}, jax.tree.map(lambda x: x[:1], weights[0])):
+        unequal = [weights[0], others]
+        assert refused(sejax.save_set, path, env, unequal, records, discount=0.7) == "weights"
     odd = jax.tree.map(lambda x: x.at[..., 0].set(jnp.nan), weights[1])
     assert refused(sejax.save, path, env, odd, discount=0.7) == "weights"
     assert path.read_bytes() == before

@@ -195,7 +195,7 @@ OBS = np.float32([0.3, -0.2, 0.5])
 def acting_state_of(config):
     """The state of the plainest agent of the same networks: with equal parameters."""
     plain = {"one_hot_actions": False} if is_discrete(config) else {}
-    return state_of(replace(config, noisy_tests=False, **plain))
+    return state_of(replace(config, **plain))
 
 
 def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
@@ -263,12 +263,3 @@ def test_tests_are_without_noise():
     best = int(np.argmax(actor_outputs(PLAIN, state_of(PLAIN), OBS)))
     index = jax.jit(jax.vmap(agent_of(PLAIN).env_action))(drawn)
     assert index.dtype == jnp.int32 and (np.asarray(index) == best).all()
-
-
-@pytest.mark.parametrize("config", [CONFIG, PLAIN], ids=["continuous", "discrete"])
-def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
-    noisy = replace(config, noisy_tests=True)
-    np.testing.assert_allclose(
-        drawn_actions(noisy, explore=False, warming_up=True), drawn_actions(config, explore=True),
-        rtol=1e-5, atol=1e-6,
-    )  # fmt: skip

@@ -82,15 +82,9 @@ class DuelingDDQNConfig(DDQNConfig):
     stream_hidden_size: Count = 32
 
     def network(self, num_actions: int) -> nn.Module:
-        return DuelingMLP(
-            num_actions,
-            self.feature_dim,
-            self.hidden_size,
-            self.num_layers,
-            self.stream_hidden_size,
-            self.stream_num_layers,
-            self.activation,
-        )
+        shared = self.feature_dim, self.hidden_size, self.num_layers
+        streams = self.stream_hidden_size, self.stream_num_layers
+        return DuelingMLP(num_actions, *shared, *streams, self.activation)
 
 
 @dataclass(frozen=True, kw_only=True)

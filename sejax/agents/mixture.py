@@ -17,7 +17,7 @@ from pydantic import Field
 
 from sejax.agents.base import Agent
 from sejax.ops.scores import finite_mean, is_tie
-from sejax.options import Options, require
+from sejax.options import LARGEST, Options, require
 from sejax.options.registry import require_part
 
 Weight = Annotated[float, Field(ge=0, le=1e6)]
@@ -51,8 +51,8 @@ class Mixture:
       config: how the agents' scores are combined.
 
     Raises:
-      ConfigError: without agents, unless each has a name and a weight, for a weight below 0, or if
-        all weights are 0.
+      ConfigError: without agents, unless each has a name and a weight, for a weight below 0, if
+        all weights are 0, or for what is no agent.
 
     Example:
       >>> import sejax
@@ -73,11 +73,13 @@ class Mixture:
         size = len(self.agents)
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
-        is_weighted = min(self.weights, default=0) >= 0 and max(self.weights, default=0) > 0
+        is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
         is_whole = is_weighted and len(self.names) == len(self.weights) == size
         must = "must have a name and a weight each, one above 0 and none below"
         got = f"{size} agents, weights={self.weights} and names={self.names}"
         require(is_whole, "agents", must, got=got, fix="Set names=() and weights=().")
+        for agent in self.agents:
+            require_part("agent", Agent, agent)
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":
@@ -88,7 +90,6 @@ class Mixture:
         """
         if isinstance(agent, Mixture):
             return agent
-        require_part("agent", Agent, agent)
         return cls(agents=(agent,))
 
     @property

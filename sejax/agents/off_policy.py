@@ -56,9 +56,8 @@ class OffPolicyOptions(AgentOptions):
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
-        return MLP(
-            num_outputs, self.hidden_size, self.num_layers, self.activation, learn_prelu_slope=True
-        )
+        shape = self.hidden_size, self.num_layers, self.activation
+        return MLP(num_outputs, *shape, learn_prelu_slope=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -201,9 +201,8 @@ class PPO(Learner):
         self.config, self.obs_dim, self.length = config, obs_dim, length
         self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
         shape = (config.hidden_size, config.num_layers, config.activation)
-        self.actor, self.critic = (
-            MLP(size, *shape, learn_prelu_slope=True) for size in (action_dim, 1)
-        )
+        self.actor = MLP(action_dim, *shape, learn_prelu_slope=True)
+        self.critic = MLP(1, *shape, learn_prelu_slope=True)
         self.optimizer = config.optimizer()
 
     def buffer(self) -> BufferMaker:

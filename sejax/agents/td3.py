@@ -35,18 +35,16 @@ class TD3Config(ActorCriticOptions):
       policy_delay: learning steps of the critics for each one of the actor and the targets
       action_noise_std: Exploration noise, in units of the largest action.
       target_noise_std: Noise that smooths the target policy, in the same units.
-      noisy_tests: exploration noise in tests too, as in the authors' code
 
     Differs: the authors do not scale the target policy's noise by the largest action. There is no
-    difference if the largest action is 1, as in all of the paper's tasks. Tests are without
-    exploration noise unless `noisy_tests` is set.
+    difference if the largest action is 1, as in all of the paper's tasks. They test with
+    exploration noise; here tests take the best action.
     """
 
     policy_delay: Count = 2
     action_noise_std: NonNegative = option(0.1, traced=True)
     target_noise_std: NonNegative = option(0.2, traced=True)
     target_noise_clip: NonNegative = option(0.5, traced=True)
-    noisy_tests: bool = False
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
@@ -68,7 +66,7 @@ class DiscreteTD3Config(TD3Config):
       one_hot_actions: straight-through one-hot actions in place of soft ones
 
     Differs: the temperature reaches its final value after `temperature_steps` learning steps, in
-    the authors' code one step earlier. Tests take the likeliest action unless `noisy_tests` is set.
+    the authors' code one step earlier. Tests take the likeliest action.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
@@ -157,14 +155,12 @@ class TD3(ActorCritic):
 
     def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
         outputs = self.outputs(state.actor, obs)
-        if not explore and not self.config.noisy_tests:
+        if not explore:
             return self.best(outputs)
         key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
         action = self.action(outputs, self.draw(key_policy, outputs.shape), state)
         noise = self.max_action * jax.random.normal(key_noise, outputs.shape)
         action = self.restrict(action + state.hparams.action_noise_std * noise)
-        if not explore:
-            return action
         return jnp.where(state.is_warming_up, self.warm_up(key_warm_up), action)
 
     def update(self, key: Array, state: TD3State, batch: Transition) -> TD3State:

@@ -7,13 +7,14 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
 from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
 from sejax.ops.scores import below_all
-from sejax.options import Count, Decay, require, require_known
+from sejax.options import LEAST, Count, Decay, require, require_known
 
 if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
@@ -75,7 +76,9 @@ class EvosaxConfig(StrategyOptions):
         if self.name == "open_es":
             # evosax computes the next generation's std from the number of the current generation.
             std, decay = self.noise_std, self.noise_std_decay
-            options["std_schedule"] = optax.exponential_decay(std * decay, 1, decay)
+            schedule = optax.exponential_decay(std * decay, 1, decay)
+            # It divides by the std, which after many generations would be 0 in 32 bits.
+            options["std_schedule"] = lambda number: jnp.maximum(schedule(number), LEAST)
         algorithm = distribution_based_algorithms[cls](
             population_size=self.population_size, solution=jnp.zeros(num_dims), **options
         )
@@ -105,6 +108,8 @@ def from_evosax(
 ) -> Strategy:
     """A strategy from an algorithm of evosax. The algorithm's mean is the incumbent.
 
+    A generation in which all scores are equal, or none is finite, changes nothing.
+
     Args:
       algorithm: a distribution-based algorithm for vectors `[num_dims]`.
       params: of the algorithm; its `default_params` if not given.
@@ -128,7 +133,10 @@ def from_evosax(
         # becomes worse than the worst.
         finite = jnp.isfinite(scores)
         fitness = -jnp.where(finite, scores, finite.any() * below_all(scores))
-        return algorithm.tell(key, population, fitness, state, params)[0]
+        told = algorithm.tell(key, population, fitness, state, params)[0]
+        # Some algorithms move, or shrink their std, where no candidate is better than another.
+        is_told = fitness.max() > fitness.min()
+        return jax.tree.map(lambda new, old: jnp.where(is_told, new, old), told, state)
 
     return Strategy(
         init=lambda key, mean: algorithm.init(key, mean, params),

@@ -81,8 +81,8 @@ def make_vec(
     _, world = _read(source, task)
     num_envs = checked(num_envs, Count, "num_envs", 8)
     if world is None:
-        env_fns = [partial(make, source, task)] * num_envs
-        return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
+        mode = AutoresetMode(autoreset_mode)
+        return SyncVectorEnv([partial(make, source, task)] * num_envs, autoreset_mode=mode)
     return SyntheticVectorEnv(world, num_envs, autoreset_mode)
 
 

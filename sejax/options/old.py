@@ -8,7 +8,7 @@ from sejax.options import registry
 # Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
 GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
 GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
-GONE |= dict.fromkeys(("train_every", "gradient_steps", "target_update_every"), 1)
+GONE |= {"noisy_tests": False, "train_every": 1, "gradient_steps": 1, "target_update_every": 1}
 
 
 def of_today(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -66,16 +66,11 @@ class Group(NamedTuple):
 
 GROUPS = {
     "env": Group("sejax.envs", "sejax.envs.base:Task", ()),
-    "agent": Group("sejax.agents", "sejax.agents:Agent", ("task",), "sejax.agents:AgentConfig"),
+    "agent": Group("sejax.agents", "sejax:Agent", ("task",), "sejax.agents:AgentConfig"),
     "exploration": Group(
-        "sejax.explorations",
-        "sejax.agents:Agent",
-        ("agent", "task"),
-        "sejax.agents:ExplorationConfig",
+        "sejax.explorations", "sejax:Agent", ("agent", "task"), "sejax.agents:ExplorationConfig"
     ),
-    "proxy": Group(
-        "sejax.proxies", "sejax.proxies:ProxyEnv", ("task",), "sejax.proxies:ProxyConfig"
-    ),
+    "proxy": Group("sejax.proxies", "sejax:ProxyEnv", ("task",), "sejax.proxies:ProxyConfig"),
     "objective": Group("sejax.objectives", "sejax.objectives:Objective", ("task",)),
     "es": Group("sejax.strategies", "sejax.es.base:Strategy", ("num_dims",)),
     "tracker": Group("sejax.trackers", "sejax.runs.trackers:Tracker", ("run",)),

@@ -191,7 +191,8 @@ def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Age
       0
     """
     env, config = _stored_env(proxy)
-    stored = config["agents"] or {"": None}
+    stored = config["agents"]
+    require(stored, "proxy", "must have been learned with an agent", fix="Use sejax.make_agent.")
     name = next(iter(stored)) if name is None else name
     require_known("name", name, stored)
     agent = header.configured("agent", stored[name], env.name)
@@ -295,7 +296,11 @@ def save_set(
     require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(discount is not None or not env.config.needs_discount, "discount", must)
-    stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
+    try:
+        stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
+    except (ValueError, TypeError) as error:
+        must = "must be numbers, of the same names and shapes for each proxy"
+        raise ConfigError.of("weights", must, got=told(error), use="params.weights") from error
     tensors = flatten_dict(stacked, sep="/")
     _require_weights("weights", tensors, env, len(records), "params.weights")
     if not is_set:

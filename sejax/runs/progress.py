@@ -71,9 +71,12 @@ class RunProgress:
         named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
         named["exploration"] = self._config.name("exploration")
         words = "".join(f" {name}={text}" for name, text in named.items() if ":" in text)
+        words += " agent_hparams=as_learned" if ":" in named["agents"] else ""
         fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
-        arguments += f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else ""
+        if ":" in proxy:
+            choice = to_plain(self._config.proxy, "proxy")
+            arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})"
         self.say(
             f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'finished'}\n"
             f"{verdict}\n\n"
