@@ -22,7 +22,7 @@ from sejax.runs.compose import expand
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 
-OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"]
+OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic=ddqn", "agents.myopic.discount=0"]
 
 
 def refused(*overrides, make=sejax.config):

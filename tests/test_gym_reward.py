@@ -257,7 +257,7 @@ def test_the_network_sees_the_tasks_own_observations():
 def test_the_info_of_an_unknown_task_is_not_known(stored_rn):
     options = {"interface": envs.make("cartpole").interface, "variant": "exclusive_weighted_info"}
     path, _ = stored_rn(4, "mine", **options)
-    assert refused(RewardNetwork, gymnasium.make("CartPole-v1"), path) == "task"
+    assert refused(RewardNetwork, gymnasium.make("CartPole-v1"), path) == "source"
 
 
 def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):

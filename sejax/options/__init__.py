@@ -95,7 +95,7 @@ def errors_of(group: str, where: str) -> Iterator[None]:
         if group in ("", where):
             raise
         name = re.escape(group)
-        message = re.sub(rf"\b{name}(?=\.\w| must )", where, str(error))
+        message = re.sub(rf"\b{name}(?=\.\w| must |=)", where, str(error))
         raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
 
 

@@ -29,6 +29,7 @@ from sejax.options.plain import expanded, fields_of, flatten, merge, split, unqu
 from sejax.options.registry import key_of
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
+AGENT_BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")  # the two: old fields
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
 # The text of sejax's own preset files, by their stems.
@@ -142,14 +143,15 @@ def _beside(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
     """Values by their names in words as a tree, in which all agents stand under `agents`.
 
-    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents, and `agents.KEY.name=ddqn` one by any key.
+    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents, and `agents.KEY=ddqn` one by any key.
     Fields of an only agent, `agent.FIELD`, stay in `agent` until its key is known.
     """
     tree: Tree = {"agents": {}}
     chosen: list[str] = []
     for name in sorted(values, key=lambda name: name not in ("agent", "agents")):
         value = values[name]
-        path = [name, "name"] if name in groups else name.split(".")
+        is_choice = name in groups or AGENT_BY_KEY.fullmatch(name)
+        path = [*name.split("."), "name"] if is_choice else name.split(".")
         if name in ("agent", "agents"):
             text = str(value)
             is_list = text.startswith("[") and text.endswith("]")

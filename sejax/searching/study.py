@@ -294,8 +294,7 @@ def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     words = [*search.fixed, *overrides]
     line = shlex.join(["python", "-m", "sejax.run", *words])
     read = search.default.named(layers_of(LearnConfig, words)["typed"])
-    keys = {f"agents.{key}": f"agents.{key}.name" for key in search.default.agents}
-    settings = {keys.get(k, k): parsed(x) if isinstance(x, str) else x for k, x in read.items()}
+    settings = {name: parsed(x) if isinstance(x, str) else x for name, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
     write_text(search.folder / "best.txt", f"{line}\n")
     write_text(search.folder / "preset.yaml", f"# {line}\n{text}")
