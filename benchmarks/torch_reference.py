@@ -89,16 +89,6 @@ def params_from_flax(tree: dict[str, Any]) -> list[Tensor]:
     return [torch.tensor(np.asarray(array, np.float32)) for array in arrays]
 
 
-def params_to_flax(params: list[Tensor]) -> dict[str, Any]:
-    """Inverse of `params_from_flax`."""
-    arrays = [p.detach().numpy().copy() for p in params]
-    tree: dict[str, Any] = {
-        f"Dense_{i}": {"kernel": arrays[2 * i], "bias": arrays[2 * i + 1]}
-        for i in range(len(arrays) // 2)
-    }
-    return tree | ({"prelu_slope": arrays[-1].reshape(())} if len(arrays) % 2 else {})
-
-
 def _layer_number(name: str) -> int:
     return int(name.removeprefix("Dense_"))
 

@@ -145,7 +145,7 @@ class Bilevel:
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
         scores = self.scoring.for_people(outcome)
-        score, by_agent = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
+        score, agent_means = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(
             state,
@@ -153,10 +153,10 @@ class Bilevel:
             generation=state.generation + 1,
             incumbent=candidates.incumbent,
             incumbent_score=score,
-            incumbent_scores=by_agent,
+            incumbent_scores=agent_means,
             best=jnp.where(is_best, candidates.incumbent, state.best),
             best_score=jnp.where(is_best, score, state.best_score),
-            best_scores=jnp.where(is_best, by_agent, state.best_scores),
+            best_scores=jnp.where(is_best, agent_means, state.best_scores),
             best_generation=jnp.where(is_best, state.generation, state.best_generation),
             solved=state.solved | self.is_solved(score),
         )
@@ -166,7 +166,7 @@ class Bilevel:
 
 
 def make_learner(
-    config: Any = None, *, generations: int = 100, **parts: Any
+    config: Any = None, *, generations: int | None = None, **parts: Any
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
@@ -175,7 +175,7 @@ def make_learner(
     Args:
       config: from `sejax.config`, with all parts and `generations`. What is for the command, such
         as `seed` and `run_dir`, has no effect here.
-      generations: n_o of Algorithm 1.
+      generations: n_o of Algorithm 1; by default the configuration's, or 100.
       **parts: arguments of `make_bilevel`: `task`, `agent`, and any others.
 
     Raises:
@@ -195,8 +195,9 @@ def make_learner(
     if config is not None:
         if not callable(getattr(config, "parts", None)) or parts:
             raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
-        generations, parts = config.generations, config.parts()
-    generations = checked(generations, Count, "generations", 100)
+        parts = config.parts()
+        generations = config.generations if generations is None else generations
+    generations = checked(100 if generations is None else generations, Count, "generations", 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

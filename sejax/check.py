@@ -128,8 +128,8 @@ def run(config: CheckConfig) -> dict[str, Any]:
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
     require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
-    see = all(hasattr(agent, "discount") for agent in learned.values())
-    require(see, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
+    have_one = all(hasattr(agent, "discount") for agent in learned.values())
+    require(have_one, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
     zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
     require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
     names = agents.fitting(task) if config.algorithms is None else config.algorithms

@@ -85,8 +85,8 @@ class GenerationEvaluator:
         training = tested_throughout(training) if objective.needs_tests else training
 
         def evaluator_of(agent: Agent) -> Callable[[Trainings], Outcome]:
-            worlds = proxy, proxy.task, training, objective.test_env
-            evaluate = make_evaluator(agent, *worlds, in_batches=False)
+            task, test_env = proxy.task, objective.test_env
+            evaluate = make_evaluator(agent, proxy, task, training, test_env, in_batches=False)
 
             def run(one: Trainings) -> Outcome:
                 params = proxy.params(unravel(one.weights))

@@ -16,7 +16,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from sejax.bilevel import make_bilevel
-from sejax.options import FailedError
+from sejax.options import FailedError, require
 from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig
@@ -41,20 +41,22 @@ def help_text(overrides: Sequence[str]) -> str:
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     """The configuration of each run that the overrides describe, with folders of their own."""
-    configs = compose.swept(
-        overrides,
-        configuration.config,
-        "run_dir",
-        lambda config, name: f"{config.resolved_run_dir}_{name}",
-        configuration.IN_RUN_DIR,
-    )
+
+    def folder_of(config: LearnConfig, name: str) -> str:
+        return f"{config.resolved_run_dir}_{name}"
+
+    known = configuration.IN_RUN_DIR
+    configs = compose.swept(overrides, configuration.config, "run_dir", folder_of, known)
     runs: list[LearnConfig] = []
     for config in configs:
         for seed in range(config.seed, config.seed + config.num_seeds):
             is_alone, folder = config.num_seeds == 1, config.run_dir
             folder = folder if is_alone else folder and f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    return [*{str(run.resolved_run_dir): run for run in runs}.values()]
+    by_folder = {str(run.resolved_run_dir): run for run in runs}
+    must, got = "must differ for each run in letters or digits", next(iter(by_folder), "")
+    require(len(by_folder) == len({str(run) for run in runs}), "run_dir", must, got=got)
+    return [*by_folder.values()]
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:

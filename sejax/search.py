@@ -28,6 +28,7 @@ def main(overrides: Sequence[str]) -> None:
 
     search = config.read(overrides)
     runtime.configure_jax()
+    search.default.task()  # raises if this machine cannot make it, before any trial is refused
     try:
         current = study.open_study(search)
         print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)

@@ -426,11 +426,8 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
         )
-        rows = {
-            "returns": before.episode_return,
-            "episode_ends": train_steps,
-            "test_returns": state.tested,
-        }
+        rows = {"returns": before.episode_return, "episode_ends": train_steps}
+        rows["test_returns"] = state.tested
         # Written in place; a row that is out of range is dropped.
         number = jnp.where(finished, before.episode, self.training.max_episodes)
         curve = {name: x.at[number].set(rows[name], mode="drop") for name, x in curve.items()}

@@ -188,13 +188,6 @@ def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
     assert_equal((begun.agent_state, actions), begun_and_actions(plain, state.agent_state))
 
 
-@pytest.mark.parametrize("name", agents.names())
-def test_an_agent_is_made_once_for_equal_configurations(name):
-    task = envs.make(next(task for task in TASKS if fits(name, task)))
-    agent = agents.make_agent(config_of(name), task)
-    assert agent is agents.make_agent(config_of(name), task)
-
-
 # --- agents with a replay buffer -----------------------------------------------------------------
 
 

@@ -227,6 +227,11 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
     np.testing.assert_array_equal(after.best, states[0].best)
 
 
+def test_generations_beside_a_configuration_win():
+    learn = make_learner(tiny(words=ROOM), generations=2)
+    assert jax.eval_shape(learn, jax.random.key(0)).info.generation.shape == (2,)
+
+
 @pytest.mark.parametrize(("part", "value"), [
     ("task", "nes"), ("agent", "nes"), ("proxy", "nes"), ("es", "nes"), ("objective", "nes"),
     ("generations", 0), ("generations", 1.5), ("devices", jax.device_count() + 1),

@@ -68,6 +68,9 @@ def test_agents_are_those_that_a_stored_proxy_was_learned_with(source):
     assert sejax.training_of(proxy.env) == sejax.training_of(proxy)
     assert refused(sejax.agent_of, proxy, "nope") == "name"
     assert refused(sejax.agent_of, proxy.env.bare) == "proxy"
+    assert refused(sejax.training_of, sejax.load_proxy("cartpole"), "ppo") == "agent"
+    other, training = sejax.envs.make("acrobot"), sejax.training_of(proxy)
+    assert refused(sejax.make_evaluator, agents.popitem()[1], proxy.env, other, training) == "agent"
 
 
 def test_equal_arguments_compile_once():

@@ -93,6 +93,7 @@ STEPPED = [
     ("mountain_car_continuous", {"done": "threshold", "horizon": 3}),
     ("cartpole", BANDIT),
     ("gridworld_2x2", {"done": "soft", "horizon": 1}),
+    ("pendulum", {**BANDIT, "state_units": "bounds", "reward_form": "distance"}),
     ("cartpole", {"done": "soft", "min_steps": 3}),
     ("cartpole", {"done": "bernoulli", "min_steps": 4, "horizon": 6}),
 ]
@@ -468,6 +469,8 @@ def test_a_file_that_is_no_single_se_is_refused(tmp_path):
 @pytest.mark.parametrize(("field", "options"), [
     ("num_envs", {"num_envs": 0}), ("num_envs", {"num_envs": 2.5}),
     ("autoreset_mode", {"autoreset_mode": "samestep"}), ("source", {"source": "carpole"}),
+    ("task", {"task": gymnasium.make("CartPole-v1")}),
+    ("autoreset_mode", {"source": "cartpole-rn", "autoreset_mode": "samestep"}),
 ])  # fmt: skip
 def test_an_option_that_cannot_be_is_one_message(field, options):
     assert refused(make_vec, **{"source": "cartpole"} | options) == field

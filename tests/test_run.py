@@ -292,6 +292,10 @@ def test_ctrl_c_and_sigterm_save_and_exit_130_and_143(tmp_path, number):
 def test_a_sweep_with_a_run_that_cannot_be_begins_none(tmp_path):
     words = ["agent=ppo", "agent.num_minibatches=4,1000", f"run_dir={tmp_path}/a"]
     assert refused(run.main, words) == "agent.num_minibatches" and not (tmp_path / "a").exists()
+    for sign, number in (("<", 1), (">", 2)):
+        (tmp_path / f"a{sign}.yaml").write_text(f"generations: {number}")
+    words = [f"preset={tmp_path}/a<.yaml,{tmp_path}/a>.yaml", f"run_dir={tmp_path}/a"]
+    assert refused(run.main, words) == "run_dir" and not (tmp_path / "a").exists()
 
 
 def test_a_run_in_a_pipe_says_what_it_does_and_counts_as_its_file(tmp_path, capsys):

@@ -360,17 +360,6 @@ def test_the_reward_of_a_distance_is_what_the_form_says():
         assert step_reward(env, weights, STATE, [action]) == pytest.approx(wanted, rel=1e-4)
 
 
-def test_a_distance_is_stored_and_plays_in_numpy_alike(tmp_path):
-    env, weights = distance_se()
-    sejax.save(tmp_path / "se.safetensors", env, weights)
-    alike = sejax.gym.make(str(tmp_path / "se.safetensors"))
-    obs, _ = alike.reset(seed=1)
-    action = np.array([-1.3], np.float32)
-    _, reward, terminated, *_ = alike.step(action)
-    assert terminated
-    np.testing.assert_allclose(reward, env.predict(weights, obs, action)[1], rtol=1e-4)
-
-
 @pytest.mark.parametrize("words", [
     ["proxy.reward_form=distance", "env=cartpole", "proxy.horizon=1"],
     ["proxy.reward_form=distance", "env=pendulum", "proxy.horizon=null"],

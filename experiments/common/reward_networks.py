@@ -30,18 +30,13 @@ from experiments.common.shards import read_rows, write_rows
 from sejax import ICMConfig
 from sejax.options import ConfigError, Count, listed, registry, require_known
 from sejax.options.plain import flatten
+from sejax.proxies import reward
 from sejax.runs import config as configuration
 from sejax.runs import run_directory
 
 # Paper, table "Overview of Reward Network variants".
-VARIANTS = (
-    "additive_potential",
-    "exclusive_potential",
-    "additive_non_potential",
-    "exclusive_non_potential",
-)
+VARIANTS, WEIGHTED_INFO = tuple(reward.VARIANTS)[:4], tuple(reward.VARIANTS)[4:]
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
-WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
 PAPER_ROWS = ("default", "varied", "transfer")
 OBJECTIVES = tuple(registry.BUILT_IN["objective"])
 

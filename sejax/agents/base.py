@@ -137,10 +137,7 @@ class Agent:
 
     def drawn_values(self, key: Array) -> dict[str, Array]:
         """The hyperparameters that `fresh` draws for a training with this key, by name."""
-        if self.varied is None:
-            return {}
-        _, _, values = self.varied.draw(drawing_key(key))
-        return values
+        return {} if self.varied is None else self.varied.draw(drawing_key(key))[2]
 
 
 class Varied(NamedTuple):

@@ -162,13 +162,8 @@ def row_width(obs_dim: int, action_dim: int | None = None) -> int:
 
 def pack(transition: Transition) -> Float[Array, " width"]:
     """One transition as a row."""
-    parts = (
-        transition.obs,
-        transition.next_obs,
-        transition.action,
-        transition.reward,
-        transition.discount,
-    )
+    obs, action, reward, discount, next_obs, _ = transition
+    parts = obs, next_obs, action, reward, discount
     return jnp.concatenate([jnp.atleast_1d(x).astype(jnp.float32) for x in parts])
 
 

@@ -88,9 +88,7 @@ class Mixture:
         Raises:
           ConfigError: for anything else.
         """
-        if isinstance(agent, Mixture):
-            return agent
-        return cls(agents=(agent,))
+        return agent if isinstance(agent, Mixture) else cls(agents=(agent,))
 
     @property
     def size(self) -> int:

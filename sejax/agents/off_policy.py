@@ -117,8 +117,3 @@ def adam_step(
     count = num_columns(columns[0])
     gradient = jax.tree.map(lambda x: x / count, total)
     return apply_gradient(params, opt_state, gradient, hparams.learning_rate)
-
-
-def soft_update(target: Params, online: Params, tau: Array | float) -> Params:
-    """The parameters of a target network that follows the online one with weight `tau`."""
-    return jax.tree.map(lambda x, y: tau * x + (1 - tau) * y, online, target)

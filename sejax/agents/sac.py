@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, soft_update
+from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops.networks import init_narrowed
@@ -169,13 +169,14 @@ class SAC(ActorCritic):
         def sum_of_losses(params: Params, batch: Transition, noise: LearningNoise) -> Array:
             return jnp.sum(batch.weight * self.losses(params, state, batch, noise))
 
+        hp = state.hparams
         params, opt_state = adam_step(
-            sum_of_losses, state.params, state.opt_state, (batch, noise), state.hparams
+            sum_of_losses, state.params, state.opt_state, (batch, noise), hp
         )
         return state.replace(
             params=params,
             opt_state=opt_state,
-            target_critics=soft_update(state.target_critics, params.critics, state.hparams.tau),
+            target_critics=optax.incremental_update(params.critics, state.target_critics, hp.tau),
         )
 
     def losses(

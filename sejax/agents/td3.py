@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step, soft_update
+from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import ADAM
@@ -219,8 +219,8 @@ class TD3(ActorCritic):
         return state.replace(
             actor=actor,
             actor_opt_state=opt_state,
-            target_actor=soft_update(state.target_actor, actor, hp.tau),
-            target_critics=soft_update(state.target_critics, state.critics, hp.tau),
+            target_actor=optax.incremental_update(actor, state.target_actor, hp.tau),
+            target_critics=optax.incremental_update(state.critics, state.target_critics, hp.tau),
         )
 
     def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "action_dim *batch"]:

@@ -155,10 +155,9 @@ def _as_gymnax(space: Space) -> Any:
 
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
+    # gymnax's wrappers want numbers.
     bounds = (bound[0] if space.size == 1 else bound for bound in (space.low, space.high))
-    low, high = (
-        jnp.array(bound, jnp.float32) for bound in bounds
-    )  # gymnax's wrappers want numbers
+    low, high = (jnp.array(bound, jnp.float32) for bound in bounds)
     return spaces.Box(low, high, (space.size,), jnp.float32)
 
 

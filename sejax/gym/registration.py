@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
-from sejax.options import Count, checked, require, require_package
+from sejax.options import Count, checked, require, require_known, require_package
 from sejax.options.plain import configure
 from sejax.proxies.header import PRETRAINED_DIR, Header, pretrained_names, read
 
@@ -81,7 +81,8 @@ def make_vec(
     _, world = _read(source, task)
     num_envs = checked(num_envs, Count, "num_envs", 8)
     if world is None:
-        mode = AutoresetMode(autoreset_mode)
+        mode = str(getattr(autoreset_mode, "value", autoreset_mode))
+        require_known("autoreset_mode", mode, [x.value for x in AutoresetMode])
         return SyncVectorEnv([partial(make, source, task)] * num_envs, autoreset_mode=mode)
     return SyntheticVectorEnv(world, num_envs, autoreset_mode)
 
@@ -142,9 +143,11 @@ def _read(source: Source, task: RealTask | str | None) -> tuple[Header, Syntheti
       ConfigError: as `make`.
     """
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
+    kinds: Any = str | None if header.kind == "rn" else RealTask | str | None
+    must = "must be an id of Gymnasium, or a RealTask for an SE"
+    fix = "Set task=ID; RewardNetwork(env, source) wraps an environment."
+    require(isinstance(task, kinds), "task", must, got=task, fix=fix)
     if header.kind == "rn":
-        message = "must be an id of Gymnasium for an RN; got a RealTask. Set task=ID."
-        require(not isinstance(task, RealTask), "task", message)
         return header, None
     config = configure("proxy", header.config["proxy"])
     return header, SyntheticWorld(weights, config, se_task(header, config, task))

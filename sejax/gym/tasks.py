@@ -104,6 +104,8 @@ def real_env(header: Header, **options: Any) -> Env:
     use = "ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
     require(is_known, "task", must, got=config, use=use)
     if name in GRIDS:
+        mode, must = options.get("render_mode"), "must be None, as grid worlds have no picture"
+        require(mode is None, "render_mode", must, got=mode, fix="Leave it out.")
         return TimeLimit(GridWorld(name, **fields), limit)
     return gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 

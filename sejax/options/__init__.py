@@ -209,8 +209,8 @@ def option(
 
     Args:
       default: its default.
-      traced: whether it is a number that compiled programs can take as an argument, so that a
-        population may vary it without compiling anew; else it is a constant. See
+      traced: whether it is a number that a compiled program can take as an argument, as with
+        `agent_hparams=varied`; else, and by default, it is a constant of the program. See
         `sejax.agents.traced`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
       names_code: whether its text may be a `module:attribute`, which the user must type.

@@ -14,7 +14,7 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PyTree
 
-from sejax import envs
+from sejax import envs, options
 from sejax.agents import Agent, make_agent
 from sejax.agents.base import AgentConfig
 from sejax.envs.base import Task
@@ -228,6 +228,7 @@ def training_of(
     training = from_plain(TrainingConfig, stored, "training")
     if agent is None or training.max_steps is None:
         return training
+    registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
     agents, limits = config["agents"].values(), (env.max_steps, env.task.max_steps)
     known = [configure("agent", x, ()) for x in agents if header.is_registered("agent", x)]
     waited = max((x.steps_before_learning(*limits) for x in known), default=0)
@@ -296,6 +297,8 @@ def save_set(
     require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(discount is not None or not env.config.needs_discount, "discount", must)
+    gamma = 1.0 if discount is None else discount
+    gamma = options.checked(gamma, options.Fraction, "discount", 1.0)
     try:
         stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
     except (ValueError, TypeError) as error:
@@ -318,7 +321,7 @@ def save_set(
             task=env.task.name,
             interface=env.task.interface,
             config={**config, **known},
-            discount=1.0 if discount is None else float(discount),
+            discount=gamma,
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )

@@ -243,9 +243,7 @@ class RewardEnv(ProxyEnv):
         if self.config.shaping.is_potential_based:
             before = self.potential(params, state.obs, state.augmentation)
             bonus = params.discount * bonus - before
-        reward = bonus
-        if self.config.shaping.is_additive:
-            reward = real_reward + bonus
+        reward = real_reward + bonus if self.config.shaping.is_additive else bonus
         is_sane = jnp.isfinite(reward) & (jnp.abs(bonus) < MAX_ABS_VALUE)
         discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {

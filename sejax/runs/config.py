@@ -233,7 +233,7 @@ class LearnConfig(CommandConfig):
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
-        """The name of a group's choice; several agents are `ddqn+ppo`."""
+        """The name of a group's choice; of agents their keys, as `ddqn+ppo`."""
         if group == "agent":
             return "+".join(self.agents)
         return registry.name_of(group, getattr(self, group))

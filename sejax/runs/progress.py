@@ -72,7 +72,9 @@ class RunProgress:
         named["exploration"] = self._config.name("exploration")
         words = "".join(f" {name}={text}" for name, text in named.items() if ":" in text)
         words += " agent_hparams=as_learned" if ":" in named["agents"] else ""
-        fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
+        texts = {name: repr(value) for name, value in env.items()}
+        texts |= {k: f"float('{x}')" for k, x in env.items() if x in (np.inf, -np.inf)}
+        fields = ", ".join(f"{name}={text}" for name, text in texts.items())
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
         if ":" in proxy:
             choice = to_plain(self._config.proxy, "proxy")

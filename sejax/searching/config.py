@@ -8,7 +8,7 @@ from typing import Any
 
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
-from sejax.options.plain import from_plain, to_plain, unknown_field
+from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig, layers_of
@@ -122,7 +122,8 @@ def read(overrides: Sequence[str]) -> StudyPlan:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
     pairs = (override.partition("=") for override in overrides)
-    ranges = {name: text for name, _, text in pairs if spaces.is_range(text)}
+    searched = ((x, text) for x, _, text in pairs if x not in fields_of(StudyConfig))
+    ranges = {name: text for name, text in searched if spaces.is_range(text)}
     rest = [override for override in overrides if override.partition("=")[0] not in ranges]
     own, others = compose.partition(rest, StudyConfig)
     for name, text in (ranges | others).items():

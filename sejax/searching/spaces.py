@@ -24,7 +24,7 @@ import yaml
 from optuna import distributions
 
 from sejax.options import ConfigError, as_text, nearest, require, shortened, told
-from sejax.options.plain import split
+from sejax.options.plain import parsed, split
 from sejax.runs.compose import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
@@ -65,11 +65,12 @@ class Dimension:
         """The stored parameter for a field's value; None if the value is outside of the range."""
         try:
             if isinstance(self.distribution, distributions.CategoricalDistribution):
-                value = as_text(value)
+                choices = self.distribution.choices
+                value = next(x for x in choices if as_text(value) in (x, as_text(parsed(str(x)))))
             elif self.is_inverse and isinstance(value, int | float):
                 value = round(1 - value, 12)
             is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
-        except (TypeError, ValueError):
+        except (StopIteration, TypeError, ValueError):
             return None
         return value if is_held else None
 

@@ -35,9 +35,8 @@ def load() -> ctypes.CDLL:
       ConfigError: if it has to be built and cannot be, or JAX's default device is no CPU; the
         message says what helps.
     """
-    got = f"got {jax.default_backend()}. Set JAX_PLATFORMS=cpu"
-    if jax.default_backend() != "cpu":
-        raise ConfigError(f"must run on the CPU; {got}")
+    if (backend := jax.default_backend()) != "cpu":
+        raise ConfigError(f"must run on the CPU; got {backend}. Set JAX_PLATFORMS=cpu")
     with _LOADING:  # XLA takes only one library in a process
         return _load()
 
