@@ -105,7 +105,8 @@ def test_every_preset_names_fields_with_bounds_that_are_accepted(name, words):
 @pytest.mark.parametrize(("word", "field"), [
     ("trials=0", "trials"), ("max_generations=2", "max_generations"), ("space=papr_se", "space"),
     ("generations=5", "generations"), ("machines.workers=2", "machines.workers"),
-    ("trials=1,2", "trials"), ("sampler=random", "sampler"), ("proxy=cartpole", "proxy"), ("es.a=1,2", "es.a"),
+    ("sampler=random", "sampler"), ("proxy=cartpole", "proxy"), ("es.a=1,2", "es.a"),
+    ("trials=1,2", "trials"),
 ])  # fmt: skip
 def test_bad_overrides_are_refused(word, field):
     assert refused(search_config.read, ["es.noise_std=0.1,0.2", word]) == field
