@@ -1,9 +1,9 @@
 """Files on the Hugging Face Hub, by `huggingface_hub` (the extra `hub`), which is imported if used.
 
-An address is `hf://USER/REPO`, with a revision (branch, tag or commit) after `@`, and the file's
-path at the end unless it is `proxy.safetensors`: `hf://USER/REPO@v1/cartpole.safetensors`. Only
-safetensors files of bounded size are fetched. The Hub's own cache keeps them, and works without a
-network.
+An address is `hf://USER/REPO`, with a revision after `@` (a branch or tag without a slash, a
+commit, or `refs/pr/N`), and the file's path at the end unless it is `proxy.safetensors`:
+`hf://USER/REPO@v1/cartpole.safetensors`. Only safetensors files of bounded size are fetched. The
+Hub's own cache keeps them, and works without a network.
 """
 
 import contextlib
