@@ -249,10 +249,11 @@ def make_bilevel(
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, mean.size)
     asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
-    size, must = strategy.population_size, "must ask for population_size vectors, in pairs if"
+    size = strategy.population_size
+    must = f"must ask for population_size vectors of {mean.size} numbers, in pairs if antithetic"
     is_whole = asked.shape == (size, mean.size) and not (strategy.antithetic and size % 2)
     got = f"{asked.shape}, population_size={size}, antithetic={strategy.antithetic}"
-    require(is_whole, "es", f"{must} antithetic, of {mean.size} numbers", got=got)
+    require(is_whole, "es", must, got=got)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,

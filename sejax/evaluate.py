@@ -106,7 +106,7 @@ class EvaluateConfig(CommandConfig):
 
         Raises:
           ConfigError: without a proxy; for agents of the proxy that are neither registered nor
-            typed; with `agent_hparams=as_learned`, if words name agents, or if the file has none.
+            typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
         """
         fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
         require("proxy" in typed, "proxy", f"must be given. {fix}")

@@ -227,7 +227,8 @@ def make_trainer(
         number = training.num_tests_between
         raise ValueError(f"training.num_tests_between={number} needs a test_fn; got None.")
     test_fn = test_fn if training.num_tests_between else None
-    if test_fn is None and (proxy := proxy_in(env)) is not None:  # tests may end a curve
+    # A curve of tests may end at either limit.
+    if test_fn is None and (proxy := proxy_in(env)) is not None:
         require_reachable("training", training, proxy.max_steps)
     world = repeat_actions(env, agent.spec.action_repeat)
     train = _Loop(agent, world, training, solved_reward, test_fn, keeps_stored).train

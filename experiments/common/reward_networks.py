@@ -35,7 +35,8 @@ from sejax.runs import config as configuration
 from sejax.runs import run_directory
 
 # Paper, table "Overview of Reward Network variants".
-VARIANTS, WEIGHTED_INFO = tuple(reward.VARIANTS)[:4], tuple(reward.VARIANTS)[4:]
+VARIANTS = tuple(x for x, shaping in reward.VARIANTS.items() if not shaping.weighs_info)
+WEIGHTED_INFO = tuple(x for x, shaping in reward.VARIANTS.items() if shaping.weighs_info)
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
 PAPER_ROWS = ("default", "varied", "transfer")
 OBJECTIVES = tuple(registry.BUILT_IN["objective"])

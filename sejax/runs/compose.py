@@ -29,7 +29,8 @@ from sejax.options.plain import expanded, fields_of, flatten, merge, split, unqu
 from sejax.options.registry import key_of
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
-AGENT_BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")  # the two: old fields
+# `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
+AGENT_BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
 # The text of sejax's own preset files, by their stems.

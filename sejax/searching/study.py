@@ -291,6 +291,7 @@ def _tried_again(study: optuna.Study, search: StudyPlan, number: int) -> dict[st
 
 def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     """Writes settings as a command and as a preset; returns the command."""
+    # A preset file of a run names its folder, which holds that run.
     words = [*search.fixed, *overrides, *["run_dir=null"] * bool(search.default.run_dir)]
     line = shlex.join(["python", "-m", "sejax.run", *words])
     read = search.default.named(layers_of(LearnConfig, words)["typed"])
