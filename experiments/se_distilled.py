@@ -20,7 +20,7 @@ import sejax
 from experiments.common import agents, figures, tables
 from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
-from sejax import distill
+from sejax.distill import __main__ as distill
 from sejax.options import Count
 
 QUICK = (

@@ -31,9 +31,9 @@ from pydantic import Field
 
 from sejax import agents
 from sejax.agents.base import AgentConfig
-from sejax.distillation.policies import CopyConfig, copied
-from sejax.distillation.policy_search import SearchConfig, searched
-from sejax.distillation.teaching import counted
+from sejax.distill.policies import CopyConfig, copied
+from sejax.distill.policy_search import SearchConfig, searched
+from sejax.distill.teaching import counted
 from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import ENOUGH, judge, verdict_of

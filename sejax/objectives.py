@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
 from sejax.envs.wrappers import PartlyScored, PartParams
-from sejax.options import Count, NonNegative, Options, require
+from sejax.options import MOST, Count, NonNegative, Options, require
 
 
 @struct.dataclass
@@ -79,6 +79,8 @@ class Objective:
     def __call__(self, outcome: Outcome, for_people: bool = False) -> Float[Array, "*agent"]:
         """The scores that compare candidates, or those that people see; nan for diverged agents.
 
+        A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
+
         Raises:
           ConfigError: unless there is a score for each agent.
         """
@@ -86,7 +88,7 @@ class Objective:
         scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
         must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
         require(scores.shape == shape, "objective", must)
-        return jnp.where(outcome.nonfinite, jnp.nan, scores)
+        return jnp.where(outcome.nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 
 
 @dataclass(frozen=True, kw_only=True)

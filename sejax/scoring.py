@@ -25,12 +25,11 @@ class Scores:
     """Scores of a generation.
 
     Attributes:
-      population: one for each training, candidate by candidate; not finite for agents that
-        diverged.
+      population: one for each training, candidate by candidate; nan for agents that diverged.
       incumbent: one for each training, `[turn, agent]` flattened; agents that diverged rank last.
       agent_means: the incumbent's mean with each agent of a mixture; nan if all of them diverged.
       incumbent_mean: the incumbent's score; nan if all trainings with one of the agents diverged.
-      diverged: whether the score of a training is not finite; the incumbent's trainings come last.
+      diverged: whether the agent of a training diverged; the incumbent's trainings come last.
     """
 
     population: Float[Array, " evaluation"]
@@ -147,13 +146,12 @@ class Scoring:
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
     ) -> GenerationInfo:
         """The statistics of a generation."""
-        finite_or_nan = jnp.where(jnp.isfinite(scores.population), scores.population, jnp.nan)
         return GenerationInfo(
             generation=generation,
             incumbent_mean=scores.incumbent_mean,
             incumbent_std=jnp.nanstd(scores.incumbent),
             population_mean=finite_mean(scores.population),
-            population_max=jnp.nanmax(finite_or_nan),
+            population_max=jnp.nanmax(scores.population),
             best_so_far=best,
             train_steps_mean=outcome.train_steps.mean(),
             train_steps_max=outcome.train_steps.max(),
@@ -178,7 +176,7 @@ class Scoring:
             numbers = self.trainings_of(agent_index)
             on_incumbent = numbers[numbers >= num_in_population] - num_in_population
             of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
-            repaired, mean = self.evaluations.incumbent_scores(*of_agent)
+            repaired, mean = self.evaluations.with_diverged_last(*of_agent)
             incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
@@ -188,7 +186,7 @@ class Scoring:
             incumbent=incumbent,
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
-            diverged=~jnp.isfinite(scores),
+            diverged=jnp.isnan(scores),
         )
 
     def _by_agent(

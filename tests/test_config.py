@@ -10,9 +10,10 @@ import yaml
 from support import ended, evaluation, printed, refusal
 
 import sejax
-from sejax import distill, evaluate, run
+from sejax import evaluate, run
 from sejax.agents.mixture import MixtureConfig
-from sejax.distillation.policies import CopyConfig
+from sejax.distill import __main__ as distill
+from sejax.distill.policies import CopyConfig
 from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
@@ -78,8 +79,7 @@ def test_values_are_read_by_the_types_of_their_fields():
 
 
 def test_each_agent_of_a_mixture_has_fields_and_may_have_a_name_of_its_own():
-    words = ["mixture.weights.myopic=2", "mixture.aggregate=min"]
-    config = sejax.config([*OWN_NAME, *words])
+    config = sejax.config([*OWN_NAME, "mixture.weights.myopic=2", "mixture.aggregate=min"])
     assert config == sejax.config([*OWN_NAME, "agents.myopic.weight=2", "agents.aggregate=min"])
     sighted, myopic = config.agents.values()
     assert config.mixture == MixtureConfig(aggregate="min", weights={"ddqn": 1, "myopic": 2})

@@ -129,8 +129,8 @@ def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():
 def test_a_model_of_theirs_is_a_policy_to_distil(tmp_path, name, task):
     import jax
 
-    from sejax.distill import main
-    from sejax.distillation.policies import policy_of
+    from sejax.distill.__main__ import main
+    from sejax.distill.policies import policy_of
 
     model = PPO("MlpPolicy", gymnasium.make(name), n_steps=16, batch_size=16, seed=0, device="cpu")
     model.save(tmp_path / "model.zip")

@@ -13,7 +13,6 @@ LAYERS = [
     {"__main__"},
     {"search", "check"},
     {"run", "evaluate", "distill"},
-    {"searching", "distillation"},
     {"runs"},
     {"bilevel"},
     {"generation"},

@@ -41,7 +41,7 @@ def whole_generations(strategy):
 
     def tell(key, candidates, scores, state):
         of_population, of_incumbent = jnp.split(scores, [size * num_evals])
-        _, incumbent = evaluations.incumbent_scores(of_incumbent, of_population)
+        _, incumbent = evaluations.with_diverged_last(of_incumbent, of_population)
         scores = evaluations.population_scores(of_population.reshape(size, num_evals))
         population = candidates[: size * num_evals : num_evals]
         return strategy.tell(key, population, scores, incumbent, state)
@@ -102,8 +102,7 @@ def test_the_noise_is_normal_with_the_configured_std():
 
 @pytest.mark.parametrize("diverged", [NAN, INF, -INF])
 def test_a_sign_that_diverged_loses_to_one_that_did_not(diverged):
-    scores = [diverged, 1, 2, -9, diverged, 3, 0, 0, 0]
-    state, candidates = told(scores, score_transform="rank")
+    state, candidates = told([diverged, 1, 2, -9, diverged, 3, 0, 0, 0], score_transform="rank")
     # Members: minus -9, plus 1, minus 3; ranks 0, 1, 2 over 2.
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.5 * noise[1] - noise[2]
@@ -165,8 +164,7 @@ def test_diverged_scores_never_reach_the_mean():
     # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The lowest
     # score of all is 1, which the incumbent's agent that diverged gets: mean (1 + 1 + 4) / 3 = 2,
     # advantages 3 and 1, weights 3/4 and 1/4.
-    scores = [NAN, 5, 3, INF, NAN, 1, 1, NAN, 4]
-    state, candidates = told(scores)
+    state, candidates = told([NAN, 5, 3, INF, NAN, 1, 1, NAN, 4])
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
     np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
@@ -257,9 +255,8 @@ def climb(strategy, generations):
         key_ask, key_tell = jax.random.split(key)
         candidates, state = ask(key_ask, state)
         true_scores = -jnp.sum((candidates - TARGET) ** 2, axis=-1)
-        diverged = (5 * number + jnp.array([[0], [1]])) % 16 == index  # [2, candidates]
-        scores = jnp.where(diverged[0], NAN, jnp.where(diverged[1], INF, true_scores))
-        scores = jnp.where(number == 10, NAN, scores)
+        diverged = jnp.isin(index, (5 * number + jnp.array([0, 1])) % 16) | (number == 10)
+        scores = jnp.where(diverged, NAN, true_scores)
         return tell(key_tell, candidates, scores, state), true_scores[-1]
 
     state = strategy.init(jax.random.key(0), jnp.zeros(DIMS))

@@ -72,6 +72,11 @@ def test_a_training_that_diverged_has_no_score(objective):
     assert np.isnan(scores[0]) and np.isfinite(scores[1])
 
 
+def test_a_score_that_statistics_cannot_hold_counts_as_diverged():
+    ended = outcome([np.inf, -np.inf, -3e38, 9e29], [1] * 4, [False] * 4)
+    assert np.isnan(MaxReward().make(task())(ended)).tolist() == [True, True, True, False]
+
+
 def test_an_objective_must_score_each_agent():
     mean_of_all = Objective(score=lambda outcome: outcome.test_returns.mean())
     assert refused(mean_of_all, outcome([1.0, 2.0], [10, 10], [False, False])) == "objective"

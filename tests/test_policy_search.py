@@ -1,4 +1,4 @@
-"""sejax.distillation: the search of linear policies, copies of policies, and what SEs teach."""
+"""sejax.distill: the search of linear policies, copies of policies, and what SEs teach."""
 
 import dataclasses
 
@@ -10,8 +10,8 @@ import pytest
 from support import assert_equal, refused
 
 from sejax import envs
-from sejax.distillation.policies import CopyConfig, acting, copied, erring, visit
-from sejax.distillation.policy_search import (
+from sejax.distill.policies import CopyConfig, acting, copied, erring, visit
+from sejax.distill.policy_search import (
     Policy,
     SearchConfig,
     linear_act,
@@ -19,7 +19,7 @@ from sejax.distillation.policy_search import (
     step_size,
     with_moments,
 )
-from sejax.distillation.teaching import grades
+from sejax.distill.teaching import grades
 from sejax.envs.wrappers import Wrapper
 from sejax.runs.store import Store
 

@@ -11,7 +11,7 @@ import pytest
 from support import evaluation, refused
 
 import sejax
-from sejax.distill import read
+from sejax.distill.__main__ import read
 from sejax.evaluate import setup_of
 from sejax.options.plain import configure
 from sejax.proxies import header, zoo

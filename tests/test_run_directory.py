@@ -88,8 +88,7 @@ def change_checkpoint(path: Path, change=lambda manifest: None, **tensors) -> No
     """Writes a checkpoint anew, with another manifest or other tensors."""
     before, manifest = checksummed.read(path / CHECKPOINT, "sejax_run")
     change(manifest)
-    data = checksummed.pack(before | tensors, "sejax_run", manifest)
-    (path / CHECKPOINT).write_bytes(data)
+    (path / CHECKPOINT).write_bytes(checksummed.pack(before | tensors, "sejax_run", manifest))
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ from support import metrics, printed, refused
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
-from sejax import search as command  # noqa: E402
 from sejax.ops.files import write_text  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
 from sejax.run import learn_all  # noqa: E402
 from sejax.runs import config as configuration  # noqa: E402
-from sejax.searching import config as search_config  # noqa: E402
-from sejax.searching import study  # noqa: E402
+from sejax.search import __main__ as command  # noqa: E402
+from sejax.search import config as search_config  # noqa: E402
+from sejax.search import study  # noqa: E402
 
 SPACE = "es.noise_std=interval(0.1, 0.9)"
 ONE = ("min_generations=1", "max_generations=1")

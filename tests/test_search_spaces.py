@@ -7,10 +7,10 @@ pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'"
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from support import refusal, refused
 
-from sejax import search as command
 from sejax.options.plain import to_plain
-from sejax.searching import config as search_config
-from sejax.searching import spaces
+from sejax.search import __main__ as command
+from sejax.search import config as search_config
+from sejax.search import spaces
 
 
 @pytest.mark.parametrize(("text", "distribution"), [

@@ -16,14 +16,16 @@ from support import ended, forge, paper_se, refusal
 
 import sejax
 from experiments import se_histograms
-from sejax import distill, evaluate, run, search
+from sejax import evaluate, run
+from sejax.distill import __main__ as distill
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.run_directory import COLUMNS
 from sejax.runs.store import Store
-from sejax.searching import config as settings
+from sejax.search import __main__ as search
+from sejax.search import config as settings
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]
@@ -102,8 +104,7 @@ def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreig
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
     rows = {"metrics": np.frombuffer(f"{','.join(COLUMNS)}\n".encode(), np.uint8)}
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
-    data = checksummed.pack(rows, "sejax_run", manifest)
-    (path / "checkpoint.safetensors").write_bytes(data)
+    (path / "checkpoint.safetensors").write_bytes(checksummed.pack(rows, "sejax_run", manifest))
     assert "the same settings" in refused(run_command, *TASK, f"run_dir={path}")
 
 

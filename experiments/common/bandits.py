@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 import sejax
 from sejax.check import ARS
-from sejax.distillation.policy_search import Policy, SearchConfig, linear_act, make_search
+from sejax.distill.policy_search import Policy, SearchConfig, linear_act, make_search
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_fixed, make_recorder, make_tester
@@ -176,7 +176,7 @@ def searched(task: Task, real_steps: int, seed: int) -> Teacher:
     The search ends when the policy solves the task in `TEST_EPISODES` tests, or when `real_steps`
     are spent. Of all generations the one with the best tests is kept.
 
-    Source: `sejax.distillation.policy_search`. The stored rows are of a search of the same
+    Source: `sejax.distill.policy_search`. The stored rows are of a search of the same
     algorithm with the moments of observations from random episodes before it.
     """
     agent, init, generation = _search(task)

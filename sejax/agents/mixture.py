@@ -122,7 +122,7 @@ class Mixture:
         self,
         scores: Float[Array, " pop"],
         candidates: Sequence[np.ndarray],
-        incumbent_means: Float[Array, " agent"],
+        agent_means: Float[Array, " agent"],
     ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of candidates with different agents in one unit, and the incumbent's score.
 
@@ -130,15 +130,15 @@ class Mixture:
         agent they stay as they are.
 
         Args:
-          scores: of the candidates; a score is not finite if training diverged, and stays so.
+          scores: of the candidates; nan if training diverged, and stays so.
           candidates: of each agent, as returned by `deal`.
-          incumbent_means: the incumbent's mean with each agent; nan if all evaluations with the
+          agent_means: the incumbent's mean with each agent; nan if all evaluations with the
             agent diverged. The agent's candidates are then compared with their own mean.
         """
         if self.size == 1:
-            return scores, incumbent_means[0]
+            return scores, agent_means[0]
         compared = scores
-        for numbers, mean in zip(candidates, incumbent_means, strict=True):
+        for numbers, mean in zip(candidates, agent_means, strict=True):
             if numbers.size:
                 of_agent = scores[numbers]
                 mean = jnp.where(jnp.isfinite(mean), mean, finite_mean(of_agent))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from pydantic import Field
 
 from sejax.ops.scores import finite_mean
-from sejax.options import LEAST, MOST, Count, Options
+from sejax.options import LEAST, Count, Options
 
 # A number of candidates, each with the weights of a proxy.
 NumMembers = Annotated[int, Field(ge=2, le=100_000)]
@@ -57,24 +57,21 @@ class Evaluations:
         return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
     def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
-        """A score for each candidate; not finite if the score of one evaluation is not finite."""
-        scores = jnp.where(jnp.abs(scores) <= MOST, scores, jnp.nan)
+        """A score for each candidate; nan if the agent of one evaluation diverged."""
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 
-    def incumbent_scores(
+    def with_diverged_last(
         self, scores: Float[Array, " turn"], population: Float[Array, " evaluation"]
     ) -> tuple[Float[Array, " turn"], Float[Array, ""]]:
         """The incumbent's scores, with agents that diverged ranked last, and their mean.
 
-        Agents that diverged get the lowest finite score of their algorithm in the generation: a
-        mean without them would rank an incumbent by its other agents alone. If all diverged, the
-        mean is nan.
+        Agents that diverged have the score nan. They get the lowest score of their algorithm in the
+        generation: a mean without them would rank an incumbent by its other agents alone. If all
+        diverged, the mean is nan.
         """
-        all_scores = jnp.concatenate([population, scores])
-        lowest = jnp.nanmin(jnp.where(jnp.abs(all_scores) <= MOST, all_scores, jnp.nan))
-        finite = jnp.abs(scores) <= MOST
-        repaired = jnp.where(~finite & finite.any(), lowest, scores)
-        return repaired, finite_mean(jnp.where(jnp.abs(repaired) <= MOST, repaired, jnp.nan))
+        lowest, diverged = jnp.nanmin(jnp.concatenate([population, scores])), jnp.isnan(scores)
+        repaired = jnp.where(diverged & ~diverged.all(), lowest, scores)
+        return repaired, finite_mean(repaired)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ computes this without approximation:
 Episodes begin in a Gaussian with the mean and covariance of states that the policy visited.
 
 Such an SE is its policy in disguise: no agent was trained to learn it, and its cost is the cost of
-the policy (`sejax.distillation`).
+the policy (`sejax.distill`).
 
 Source: ours; one-step SEs with learned initial states are those of Liesen et al. (2024).
 """

@@ -12,7 +12,7 @@ from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs import config as configuration
 from sejax.runs.config import LearnConfig, layers_of
-from sejax.searching import spaces
+from sejax.search import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.

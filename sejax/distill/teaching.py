@@ -17,7 +17,7 @@ from jaxtyping import Array, PyTree
 
 from sejax.agents import make_agent
 from sejax.agents.base import Agent
-from sejax.distillation.policy_search import Arrays, Lesson
+from sejax.distill.policy_search import Arrays, Lesson
 from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv

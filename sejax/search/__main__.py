@@ -24,7 +24,7 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     require_package("sejax.search", "optuna", "search")
-    from sejax.searching import config, study
+    from sejax.search import config, study
 
     search = config.read(overrides)
     runtime.configure_jax()
@@ -46,7 +46,7 @@ def main(overrides: Sequence[str]) -> None:
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     require_package("sejax.search", "optuna", "search")
-    from sejax.searching.config import StudyConfig
+    from sejax.search.config import StudyConfig
 
     lines = field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})
     return f"{__doc__}\nFields, with their defaults:\n{lines}"

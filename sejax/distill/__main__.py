@@ -22,9 +22,9 @@ import jax
 import pandas as pd
 
 from sejax import envs
-from sejax.distillation.policies import CopyConfig, copied
-from sejax.distillation.policy_search import SearchConfig, searched
-from sejax.distillation.teaching import counted, grades, students
+from sejax.distill.policies import CopyConfig, copied
+from sejax.distill.policy_search import SearchConfig, searched
+from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, field_lines, option, require, shortened
 from sejax.options.plain import fields_of, flatten, merge

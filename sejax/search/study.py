@@ -31,7 +31,7 @@ from sejax.runs.config import LearnConfig, layers_of
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.runtime import platform_error
 from sejax.runs.store import Store
-from sejax.searching.config import FREE, REDUCTION_FACTOR, StudyPlan
+from sejax.search.config import FREE, REDUCTION_FACTOR, StudyPlan
 
 WAIT = 3600  # s, for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # errors of a database

@@ -26,7 +26,7 @@ from jaxtyping import Array, PyTree
 
 from sejax import options
 from sejax.agents import make_agent
-from sejax.distillation.policy_search import Arrays, Lesson, random_map
+from sejax.distill.policy_search import Arrays, Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import configure
