@@ -119,7 +119,7 @@ def teachers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callab
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         makes["hand"] = functools.partial(bandits.by_hand, task)
     if source == "search":
-        makes["ars"] = functools.partial(bandits.searched, task, settings.most_search_steps)
+        makes["ars"] = functools.partial(bandits.search_teacher, task, settings.most_search_steps)
     if source in ("agent", "episodes"):
         for kind, steps in TEACHERS[settings.env].items():
             config, steps = agents.tuned_agent(settings.env, kind), settings.teacher_steps or steps

@@ -31,8 +31,8 @@ from pydantic import Field
 
 from sejax import agents
 from sejax.agents.base import AgentConfig
-from sejax.distill.policies import CopyConfig, copied
-from sejax.distill.policy_search import SearchConfig, searched
+from sejax.distill.policies import CopyConfig, copy_policy
+from sejax.distill.policy_search import SearchConfig, search_policies
 from sejax.distill.teaching import counted
 from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
@@ -95,7 +95,7 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     runtime.configure_jax()
-    run(configuration.config(overrides, CheckConfig))
+    findings(configuration.config(overrides, CheckConfig))
 
 
 def help_text(overrides: Sequence[str]) -> str:
@@ -117,10 +117,10 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
       ConfigError: for an invalid field, or a proxy that cannot be judged.
     """
     words = [f"{name}={as_text(value)}" for name, value in {"proxy": proxy, **fields}.items()]
-    return run(configuration.config(words, CheckConfig))
+    return findings(configuration.config(words, CheckConfig))
 
 
-def run(config: CheckConfig) -> dict[str, Any]:
+def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
     require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
     proxy, learned = loaded(config), dict[str, Any](config.agents)
@@ -213,11 +213,11 @@ def _null(
     generations = max(1, config.null_steps // (43 * task.max_steps))
     fields = ARS | {"alive_bonus": dict[str, Any](task.origin or {}).get("healthy_reward", 0.0)}
     search = SearchConfig(**fields, generations=generations, until_solved=True)
-    (lesson,), costs = searched(search, task, 1, keys, store, config.devices)
+    (lesson,), costs = search_policies(search, task, 1, keys, store, config.devices)
     method, steps = "a random search", costs["real_steps"].sum()
     if lesson.policy_return < task.solved_reward:
         how = CopyConfig(agent_steps=config.null_steps)
-        (other,), costs = copied(how, task, "ppo", keys, store)
+        (other,), costs = copy_policy(how, task, "ppo", keys, store)
         steps += costs["real_steps"].sum()
         method, lesson = max(((method, lesson), ("a PPO", other)), key=lambda x: x[1].policy_return)
     env, weights = make_exact(task, lesson.layers, lesson.states)
@@ -263,10 +263,10 @@ def _reported(
     summary = summarise(table, ["world"])
     steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
     learning = zoo.describe(header.read(proxy.path)).learning
-    run: dict[str, Any] = vars(learning) if learning else {}  # from the file, else run.json
+    record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
     with contextlib.suppress(OSError, ValueError):
-        run = run or json.loads(proxy.path.with_name("run.json").read_text())
-    cost: dict[str, Any] = {name: run[name] for name in ("real_steps", "cpu_s") if name in run}
+        record = record or json.loads(proxy.path.with_name("run.json").read_text())
+    cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if x in record}
     if cost:  # "never" if agents trained on the proxy do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"

@@ -355,7 +355,8 @@ def evaluate_agents(
     `jax.vmap(make_evaluator(...))` up to rounding: programs of another width add in another order,
     and a training amplifies a difference in the last bit.
     """
-    require(jax.random.key_data(keys).ndim == 2, "keys", "must be several", use="split(key, 20)")
+    shape = jax.random.key_data(keys).shape if hasattr(keys, "dtype") else ()
+    require(len(shape) == 2, "keys", "must be several", use="jax.random.split(key, 20)")
     env = env.bare if isinstance(env, ProxyEnv) else env
     program = _evaluation_program(for_keys(agent, keys), env, task, training, num_parallel, devices)
     return program(keys, env_params)

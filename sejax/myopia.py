@@ -23,7 +23,7 @@ ENOUGH = 5  # independent values that an interval needs
 NONE = (math.nan, math.nan)  # the interval of fewer values
 
 
-def mean_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float]:
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
     """Student's interval of the mean of independent values `[n]`; `NONE` if n < `ENOUGH`.
 
     First average values that depend on each other, such as the agents that one proxy trained.
@@ -31,7 +31,7 @@ def mean_interval(values: ArrayLike, level: float = LEVEL) -> tuple[float, float
     values = np.asarray(values, float)
     if values.size < ENOUGH:
         return NONE
-    half = stdtrit(values.size - 1, (1 + level) / 2) * values.std(ddof=1) / values.size**0.5
+    half = stdtrit(values.size - 1, (1 + LEVEL) / 2) * values.std(ddof=1) / values.size**0.5
     return float(values.mean() - half), float(values.mean() + half)
 
 

@@ -47,7 +47,7 @@ def test_the_controller_of_cartpole_balances_and_is_copied():
 @pytest.mark.slow
 @pytest.mark.parametrize("task, least", [(CARTPOLE, 195.0), (CAR, 90.0)], ids=lambda x: str(x)[:8])
 def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
-    teacher = bandits.searched(task, real_steps=100_000, seed=0)
+    teacher = bandits.search_teacher(task, real_steps=100_000, seed=0)
     copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
     assert copied.policy_return >= least
     tests = 2 * bandits.TEST_EPISODES * 20  # of a generation, and the last ones, at least
@@ -57,7 +57,7 @@ def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
 @pytest.mark.slow
 def test_a_search_ends_when_its_steps_are_spent():
     task = dataclasses.replace(envs.make("pendulum"), max_steps=9, params=None)  # of all episodes
-    teacher = bandits.searched(task, real_steps=1, seed=0)
+    teacher = bandits.search_teacher(task, real_steps=1, seed=0)
     copied = bandits.copy(task, teacher, num_states=8, widen=0.0)
     one_generation = 2 * bandits.TEST_EPISODES + 2 * bandits.ARS["num_directions"] + 1
     assert copied.real_steps == 9 * one_generation

@@ -32,7 +32,7 @@ def save(path, *words):
 
 
 def run(path, **fields):
-    return checking.run(configuration.config(
+    return checking.findings(configuration.config(
         [f"{name}={value}" for name, value in {"proxy": path, **FEW, **fields}.items()],
         checking.CheckConfig))  # fmt: skip
 

@@ -10,7 +10,7 @@ import pytest
 from support import assert_equal, refused
 
 from sejax import envs
-from sejax.distill.policies import CopyConfig, acting, copied, erring, visit
+from sejax.distill.policies import CopyConfig, acting, copy_policy, erring, visit
 from sejax.distill.policy_search import (
     Policy,
     SearchConfig,
@@ -126,7 +126,7 @@ def balances(obs):
 def test_a_copy_does_what_the_policy_does(task, policy, hidden_size, most, tmp_path):
     config = dataclasses.replace(COPY, hidden_size=hidden_size)
     store, name = Store(tmp_path, {}), f"{__name__}:{policy.__name__}"
-    (lesson,), costs = copied(config, task, name, KEYS, store)
+    (lesson,), costs = copy_policy(config, task, name, KEYS, store)
     assert len(lesson.layers) == 1 + (hidden_size > 0)
     error = acting(task, lesson.layers)(lesson.states) - policy(lesson.states)
     assert np.sqrt((error**2).mean()) < most

@@ -11,7 +11,7 @@ import pytest
 from support import evaluation, refused
 
 import sejax
-from sejax.distill.__main__ import read
+from sejax.distill.__main__ import config_of
 from sejax.evaluate import setup_of
 from sejax.options.plain import configure
 from sejax.proxies import header, zoo
@@ -50,7 +50,7 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     proxy, stored = PROXIES[name], sejax.load_proxy(name)
     words = shlex.split(proxy.learning.command)[3:]
     if proxy.policy_return is not None:
-        config = read(words)
+        config = config_of(words)
         assert config.search.generations == proxy.learning.generations
         assert [x.agent for x in proxy.on_proxy] == list(stored.learned_agents())
     else:

@@ -65,7 +65,7 @@ def learning(monkeypatch):
 
 
 def opened(path, *overrides):
-    search = search_config.read([SPACE, f"search_dir={path}", *overrides])
+    search = search_config.plan_of([SPACE, f"search_dir={path}", *overrides])
     return study.open_study(search), search
 
 
@@ -226,14 +226,16 @@ def test_a_database_that_is_none_is_refused(tmp_path):
 def test_the_preset_file_makes_the_settings_of_the_command(tmp_path):
     (tmp_path / "mine.yaml").write_text("preset: paper\nagent_hparams: varied\n")
     fixed = ["env=acrobot", f"preset={tmp_path}/mine.yaml", "trials=3"]
-    search = search_config.read([SPACE, f"search_dir={tmp_path}", *fixed, "agent.batch_size=16,32"])
+    search = search_config.plan_of(
+        [SPACE, f"search_dir={tmp_path}", *fixed, "agent.batch_size=16,32"]
+    )
     line = study.write_best(["es.noise_std=0.25", "agent.batch_size=16"], search)
     assert (tmp_path / "best.txt").read_text() == f"{line}\n"
     best = configuration.config(shlex.split(line)[3:])
     assert configuration.config([f"preset={tmp_path}/preset.yaml"]) == best
     assert best.es.noise_std == 0.25 and best.preset == "paper" and best.agent.batch_size == 16
     several = [SPACE, f"search_dir={tmp_path}", "agents=[ddqn,ppo]", "agents.ppo.hidden_size=8"]
-    line = study.write_best(["es.noise_std=0.25"], search_config.read(several))
+    line = study.write_best(["es.noise_std=0.25"], search_config.plan_of(several))
     best = configuration.config(shlex.split(line)[3:])
     assert configuration.config([f"preset={tmp_path}/preset.yaml"]) == best
 
@@ -268,7 +270,7 @@ GRID = (
 
 
 def test_trials_are_runs_of_the_command(tmp_path):
-    search = search_config.read([*GRID, "es.noise_std=0.1,0.2", "max_generations=3", "seeds=2"])
+    search = search_config.plan_of([*GRID, "es.noise_std=0.1,0.2", "max_generations=3", "seeds=2"])
     overrides = ["es.noise_std=0.2", "agent.learning_rate=0.5"]
     run = study.learning(search.trial_config(overrides), tmp_path / "trial", range(2))
     study.learning(search.trial_config(overrides), tmp_path / "trial/seed0", range(1))(2)

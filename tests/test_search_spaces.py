@@ -56,24 +56,24 @@ def test_what_cannot_be_searched_is_refused(text):
 
 def test_overrides_are_the_searchs_own_the_space_or_fixed():
     words = ["env=acrobot", "es.noise_std=interval(0.1, 1)", "trials=7", "study=2024-01-01"]
-    search = search_config.read(words)
+    search = search_config.plan_of(words)
     assert search.fixed == ("env=acrobot",) and list(search.space) == ["es.noise_std"]
     assert (search.config.trials, search.study) == (7, "2024-01-01")
     assert search.folder.name == "search-2024-01-01"
-    assert search_config.read(words[:2]).study == "acrobot-se-ddqn"
+    assert search_config.plan_of(words[:2]).study == "acrobot-se-ddqn"
 
 
 def test_what_is_fixed_or_has_a_range_of_its_own_is_left_out_of_the_preset(tmp_path):
     (tmp_path / "p.yaml").write_text("proxy.num_layers: 1\n")
     overrides = ["space=paper_se", "es.step_size=1", "es.noise_std=0.1,0.2"]
-    search = search_config.read([*overrides, f"preset={tmp_path}/p.yaml"])
+    search = search_config.plan_of([*overrides, f"preset={tmp_path}/p.yaml"])
     assert not {"es.step_size", "proxy.num_layers"} & set(search.space)
     assert search.space["es.noise_std"].text == "0.1,0.2"
     assert "agent.batch_size" in search.space  # of the agent that the task chooses
 
 
 def test_each_agent_of_a_mixture_has_its_own_ranges():
-    search = search_config.read(["agents=[ddqn,ppo]", "space=agent"])
+    search = search_config.plan_of(["agents=[ddqn,ppo]", "space=agent"])
     assert {"agents.ddqn.tau", "agents.ppo.clip_ratio"} <= set(search.space)
 
 
@@ -90,7 +90,7 @@ COMMANDS = [
 @pytest.mark.parametrize(("name", "words"), COMMANDS)
 def test_every_preset_names_fields_with_bounds_that_are_accepted(name, words):
     assert {name for name, _ in COMMANDS} == {x.stem for x in spaces.FOLDER.glob("*.yaml")}
-    search = search_config.read([*words, f"space={name}"])
+    search = search_config.plan_of([*words, f"space={name}"])
     bounds = {
         field: getattr(x.distribution, "choices", None) or (x.distribution.low, x.distribution.high)
         for field, x in search.space.items()
@@ -109,8 +109,8 @@ def test_every_preset_names_fields_with_bounds_that_are_accepted(name, words):
     ("trials=1,2", "trials"),
 ])  # fmt: skip
 def test_bad_overrides_are_refused(word, field):
-    assert refused(search_config.read, ["es.noise_std=0.1,0.2", word]) == field
-    assert refused(search_config.read, ["env=acrobot"]) == "space"  # nothing is searched
+    assert refused(search_config.plan_of, ["es.noise_std=0.1,0.2", word]) == field
+    assert refused(search_config.plan_of, ["env=acrobot"]) == "space"  # nothing is searched
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_bad_overrides_are_refused(word, field):
 def test_a_file_of_ranges_must_map_fields_to_ranges(tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.yaml").write_text(text)
-    refusal(search_config.read, ["space=own.yaml"])
+    refusal(search_config.plan_of, ["space=own.yaml"])
 
 
 def test_help_says_what_each_field_is():

@@ -148,7 +148,7 @@ STUDIES = [
 @pytest.mark.parametrize("stored", STUDIES, ids=range(len(STUDIES)))
 def test_a_study_is_compared_as_text(folder, refused, stored):
     words = [*TASK, SPACE, f"search_dir={folder / 'theirs'}"]
-    Store(folder / "theirs", settings.read(words).settings() | stored).put("search")
+    Store(folder / "theirs", settings.plan_of(words).settings() | stored).put("search")
     assert "search_dir must be" in refused(search_command, *words)
     assert not (folder / "victim").exists()
 

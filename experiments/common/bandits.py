@@ -170,7 +170,7 @@ def _trainer(task: Task, agent: sejax.Agent, real_steps: int) -> Callable[..., A
     return train.lower(jax.random.key(0), task.params).compile()
 
 
-def searched(task: Task, real_steps: int, seed: int) -> Teacher:
+def search_teacher(task: Task, real_steps: int, seed: int) -> Teacher:
     """A linear policy found by augmented random search, on rollouts alone.
 
     The search ends when the policy solves the task in `TEST_EPISODES` tests, or when `real_steps`

@@ -77,7 +77,7 @@ class Shards:
         path = self.path(name)
         try:
             made_with, _, text = lzma.decompress(path.read_bytes()).partition(b"\n")
-            differing = differences(json.loads(made_with), settings, most=3)
+            differing = differences(json.loads(made_with), settings)
             table = pd.read_csv(io.BytesIO(text))
         except FileNotFoundError:
             return None

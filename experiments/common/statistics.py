@@ -18,7 +18,7 @@ from sejax.myopia import ENOUGH, LEVEL, NONE
 from sejax.myopia import mean_interval as mean_interval
 
 
-def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[float, float]:
+def difference_interval(first: Any, second: Any) -> tuple[float, float]:
     """Welch's confidence interval of the difference of two means, of independent values `[n], [m]`.
 
     `NONE` if either has fewer than `ENOUGH` values.
@@ -31,7 +31,7 @@ def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[
     if error == 0:
         return float(middle), float(middle)
     freedom = error**2 / (errors**2 / [first.size - 1, second.size - 1]).sum()
-    half = student.ppf((1 + level) / 2, freedom) * error**0.5
+    half = student.ppf((1 + LEVEL) / 2, freedom) * error**0.5
     return float(middle - half), float(middle + half)
 
 

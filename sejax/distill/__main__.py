@@ -22,8 +22,8 @@ import jax
 import pandas as pd
 
 from sejax import envs
-from sejax.distill.policies import CopyConfig, copied
-from sejax.distill.policy_search import SearchConfig, searched
+from sejax.distill.policies import CopyConfig, copy_policy
+from sejax.distill.policy_search import SearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, field_lines, option, require, shortened
@@ -108,7 +108,7 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    config = read(overrides)
+    config = config_of(overrides)
     runtime.configure_jax()
     try:
         distill(config, shlex.join(overrides))
@@ -119,13 +119,13 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    plain = flatten(read(overrides).plain())
+    plain = flatten(config_of(overrides).plain())
     values = {name: x for name, x in plain.items() if name.partition(".")[0] in OWN}
     classes = [("", DistillConfig), ("copy", CopyConfig), ("search", SearchConfig)]
     return f"{__doc__}\nIts own fields, with their values:\n{field_lines(values, classes, {})}"
 
 
-def read(overrides: Sequence[str]) -> DistillConfig:
+def config_of(overrides: Sequence[str]) -> DistillConfig:
     """The configuration of task, students and trainings.
 
     Raises:
@@ -171,10 +171,10 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if config.policy is None:
         shared = config.num_snapshots, keys, store, config.devices
-        lessons, costs = searched(config.search, task, *shared)
+        lessons, costs = search_policies(config.search, task, *shared)
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
-        lessons, costs = copied(config.copy, task, config.policy, keys, store)
+        lessons, costs = copy_policy(config.copy, task, config.policy, keys, store)
     store.put(CHECKPOINT)
     ses = [make_exact(task, x.layers, x.states, config.independent_starts) for x in lessons]
     best, rows = 0, pd.DataFrame()

@@ -143,7 +143,7 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
 # --- copies ---------------------------------------------------------------------------------------
 
 
-def copied(
+def copy_policy(
     config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array], store: Store
 ) -> tuple[list[Lesson], pd.DataFrame]:
     """The copy of a policy as the only lesson, and a row of its costs: `real_steps` and `cpu_s`.

@@ -248,7 +248,7 @@ class Lesson(NamedTuple):
     policy_return: float
 
 
-def searched(
+def search_policies(
     options: SearchConfig,
     task: Task,
     num_lessons: int,

@@ -22,7 +22,7 @@ StrategyState: TypeAlias = PyTree  # only the strategy reads it
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluations:
+class Evaluations(Options):
     """How often the candidates of a generation are evaluated, each time with a fresh agent.
 
     Attributes:
@@ -33,9 +33,9 @@ class Evaluations:
         incumbent's with each agent too.
     """
 
-    num_evals: int = 1
-    aggregate: str = "mean"
-    num_incumbent_evals: int = 16
+    num_evals: Count = 1
+    aggregate: Literal["mean", "min"] = "mean"
+    num_incumbent_evals: Count = 16
     common_random_numbers: bool = False
 
     def keys(self, key: Array, population_size: int, num_agents: int = 1) -> Array:

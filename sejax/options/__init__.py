@@ -136,10 +136,10 @@ def nearest(got: str, known: Iterable[str]) -> list[str]:
     return sorted(known, key=lambda name: -SequenceMatcher(None, text, name.lower()).ratio())
 
 
-def listed(names: Collection[str], most: int = 120) -> str:
-    """Names with commas between, as many as fit into `most` characters."""
+def listed(names: Collection[str]) -> str:
+    """Names with commas between, as many as fit into 120 characters."""
     text, more = ", ".join(names) or "none", " and more"
-    return textwrap.shorten(text, most, placeholder=more, break_on_hyphens=False)
+    return textwrap.shorten(text, 120, placeholder=more, break_on_hyphens=False)
 
 
 def shortened(value: object, length: int = 80) -> str:

@@ -213,7 +213,7 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differences(
-    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 10
+    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 2
 ) -> str:
     """The fields in which two nested settings differ, for a message; empty if they are equal.
 

@@ -93,7 +93,7 @@ def partition(overrides: Sequence[str], command: type) -> tuple[Tree, dict[str, 
     return own, others
 
 
-def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
+def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
     """The tree of words, over the one of the file that `preset=FILE.yaml` names.
 
     Args:
@@ -104,7 +104,7 @@ def read(overrides: Sequence[str], groups: Collection[str]) -> Tree:
       ConfigError: as `words`, and for a file that cannot be read.
 
     Example:
-      >>> read(["agent=ddqn", "es.noise_std=0.1"], ["es"])
+      >>> tree_of(["agent=ddqn", "es.noise_std=0.1"], ["es"])
       {'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}
     """
     texts: Tree = {name: unquoted(text) for name, text in words(overrides).items()}

@@ -88,7 +88,7 @@ class CommandConfig(Options):
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
-          typed: the tree of the words; see `sejax.runs.compose.read`.
+          typed: the tree of the words; see `sejax.runs.compose.tree_of`.
           imports: each `module:attribute` that may be imported.
 
         Raises:
@@ -244,8 +244,8 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The objects that the configuration describes: the arguments of `sejax.make_learner`."""
-        task, explored = self.task(), (self.exploration, self.agent_hparams == "varied")
-        learners = tuple(agents.make_agent(x, task, *explored) for x in self.agents.values())
+        task, how_made = self.task(), (self.exploration, self.agent_hparams == "varied")
+        learners = tuple(agents.make_agent(x, task, *how_made) for x in self.agents.values())
         names, weights = tuple(self.agents), tuple(self.mixture.weights.values())
         mixture = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
         return {
@@ -304,7 +304,7 @@ def config(overrides: Sequence[str] = (), command: Any = LearnConfig) -> Any:
 
 def layers_of(command: type[CommandConfig], overrides: Sequence[str]) -> dict[str, Tree]:
     """The layers that a command's words make, by their names; the words are the last one."""
-    typed = compose.read(overrides, command.groups())
+    typed = compose.tree_of(overrides, command.groups())
     layers = command.layers_below(typed, compose.plugin_paths(overrides))
     of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
     for name, value in flatten(of_only).items():

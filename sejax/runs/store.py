@@ -105,10 +105,10 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self.damaged(name, error) from error
         self._is_used = True
-        differing = differences(stored, self.settings, self._free, most=2)
+        differing = differences(stored, self.settings, self._free)
         if differing:
             stored = self.completed(stored)
-            differing = differences(stored, self.settings, self._free, most=2)
+            differing = differences(stored, self.settings, self._free)
         if differing:
             must = "must be new or made with the same settings"
             raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")

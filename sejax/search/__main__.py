@@ -26,7 +26,7 @@ def main(overrides: Sequence[str]) -> None:
     require_package("sejax.search", "optuna", "search")
     from sejax.search import config, study
 
-    search = config.read(overrides)
+    search = config.plan_of(overrides)
     runtime.configure_jax()
     search.default.task()  # raises if this machine cannot make it, before any trial is refused
     try:

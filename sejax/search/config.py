@@ -111,7 +111,7 @@ class StudyPlan:
         return {**self.default.plain(), **to_plain(self.config), "ranges": ranges}
 
 
-def read(overrides: Sequence[str]) -> StudyPlan:
+def plan_of(overrides: Sequence[str]) -> StudyPlan:
     """A search from its command's overrides.
 
     Overrides of `StudyConfig`'s fields set these. Ranges and choices are searched. All other
