@@ -130,6 +130,7 @@ def make_tester(
         nothing: Array, state: _Episode, consts: PyTree, masked: bool
     ) -> tuple[Array, _Episode]:
         key, agent_state, params = consts
+        # Resolved here too: as a part of `consts` the task's would be no constants to XLA.
         params = task.params if params is None else params
         return nothing, decide(key, agent_state, state, params)[0]
 

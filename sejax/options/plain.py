@@ -126,8 +126,8 @@ def from_plain(
         of_field = marks(cls, name)
         if isinstance(value, str | bytes) and ":" in str(value) and of_field.get("names_code"):
             registry.require_typed(full[name], str(value), imports)
-        how = defaults[name], imports, of_field.get("plugin")
-        fields[name] = _read(value, hints[name], full[name], *how)
+        at = _Place(full[name], defaults[name], of_field.get("plugin"), imports)
+        fields[name] = _read(value, hints[name], at)
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
         require(is_known, full[name], "must be given; it has no default", use="VALUE")
@@ -154,31 +154,37 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     return ConfigError.of(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
-def _read(
-    value: Any,
-    hint: Any,
-    name: str,
-    default: Any,
-    imports: Collection[str] | None,
-    group: str | None,
-) -> Any:
-    """A value as its field's type; see `sejax.options.checked`. A dictionary's keys are sorted."""
+class _Place(typing.NamedTuple):
+    """The field that a value is for: its full name, its default, its group if it holds plugins."""
+
+    name: str
+    default: Any
+    group: str | None
+    imports: Collection[str] | None  # each `module:attribute` that may be imported; None: any
+
+
+def _read(value: Any, hint: Any, at: _Place) -> Any:
+    """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf."""
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
-        how = MISSING, imports, group
-        names = {key: f"{name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
-        return {str(key): _read(value[key], of_key, names[key], *how) for key in names}
-    if group:
-        if isinstance(value, Mapping) and default is not MISSING:
-            value = {"name": registry.name_of(group, default), **value}
-        with errors_of(group, name):
-            return configure(group, value, imports)
-    is_dataclass = isinstance(hint, type) and dataclasses.is_dataclass(hint)
-    if is_dataclass and not isinstance(value, hint):
-        must = f"must have fields, as {name}.{next(iter(fields_of(hint)), 'name')}"
-        require(isinstance(value, Mapping), name, must, got=repr(value), fix="Leave it out.")
-        base = to_plain(default) if isinstance(default, hint) else {}
-        return from_plain(hint, base | value, name, imports)
+        names = {key: f"{at.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
+        places = {key: at._replace(name=x, default=MISSING) for key, x in names.items()}
+        return {str(key): _read(value[key], of_key, place) for key, place in places.items()}
+    if at.group:
+        if isinstance(value, Mapping) and at.default is not MISSING:
+            value = {"name": registry.name_of(at.group, at.default), **value}
+        with errors_of(at.group, at.name):
+            return configure(at.group, value, at.imports)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
+        must = f"must have fields, as {at.name}.{next(iter(fields_of(hint)), 'name')}"
+        require(isinstance(value, Mapping), at.name, must, got=repr(value), fix="Leave it out.")
+        base = to_plain(at.default) if isinstance(at.default, hint) else {}
+        return from_plain(hint, base | value, at.name, at.imports)
+    return _leaf(value, hint, at)
+
+
+def _leaf(value: Any, hint: Any, at: _Place) -> Any:
+    """A number, a text or a list, which may stand as an override's text: read, or else as it is."""
     reading = value
     if isinstance(value, str):
         value = expanded(value)
@@ -186,8 +192,8 @@ def _read(
     elif type(value) in (int, float):
         value = str(value)  # it may be a name of digits, such as a folder's
     with suppress(ConfigError):
-        return checked(reading, hint, name, default)
-    return checked(value, hint, name, default)
+        return checked(reading, hint, at.name, at.default)
+    return checked(value, hint, at.name, at.default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------
