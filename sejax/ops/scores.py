@@ -22,7 +22,8 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
 
 def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
     """Mean of the finite scores; nan if there is none."""
-    return jnp.mean(scores, where=jnp.isfinite(scores))
+    finite = jnp.isfinite(scores)
+    return jnp.where(finite, scores, 0.0).sum() / finite.sum()
 
 
 def or_minus_inf(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
