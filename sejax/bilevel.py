@@ -43,8 +43,8 @@ class LearnState:
     es_state: StrategyState
     generation: Array
     incumbent: Float[Array, " dims"]  # measured by the last generation, before its update
-    incumbent_score: Array
-    incumbent_scores: Float[Array, " agent"]  # one for each agent of a mixture
+    incumbent_score: Array  # `Scores.incumbent_mean`, or -inf
+    incumbent_scores: Float[Array, " agent"]  # `Scores.agent_means`, or -inf
     best: Float[Array, " dims"]
     best_score: Array
     best_scores: Float[Array, " agent"]
@@ -80,7 +80,7 @@ class Bilevel:
         task, objective = self.proxy.task, self.scoring.objective
         return task.solved_reward if objective.scores_are_returns and task.is_solvable else None
 
-    def is_solved(self, score: Array) -> Array | bool:
+    def ends_run(self, score: Array) -> Array | bool:
         """Whether this incumbent mean ends the run."""
         return self.stop_when_solved and score >= self.proxy.task.solved_reward
 
@@ -158,7 +158,7 @@ class Bilevel:
             best_score=jnp.where(is_best, score, state.best_score),
             best_scores=jnp.where(is_best, agent_means, state.best_scores),
             best_generation=jnp.where(is_best, state.generation, state.best_generation),
-            solved=state.solved | self.is_solved(score),
+            solved=state.solved | self.ends_run(score),
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved

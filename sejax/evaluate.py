@@ -46,7 +46,7 @@ SHOWN = {
 
 
 class World(NamedTuple):
-    """Where agents train, the real task that tests them, and their training limits by key."""
+    """An environment, its params, the real task of the tests, and training limits by agent key."""
 
     env: Any
     params: Any
@@ -297,7 +297,7 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
 
 
 def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -> pd.DataFrame:
-    """A row for each agent of an algorithm."""
+    """A row for each agent of an algorithm; `agent` is its number, of several its key."""
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     started = time.time()
     print(f"training {config.num_agents:,} {who} on {name} ...", flush=True)

@@ -75,7 +75,7 @@ def _greedy(
     """Builds two functions: one begins a greedy episode, the other makes a step of it.
 
     They are `(key, active, params) -> episode` and `(key, agent_state, before, params) -> (after,
-    decision)`. The step takes the key of the whole episode.
+    steps)`. The step takes the key of the whole episode.
     """
 
     def begin(key: Array, active: Array | bool, params: PyTree) -> _Episode:
@@ -298,6 +298,8 @@ def make_tested_trainer(
 
     Source: paper, section "Experiments with Reward Networks" (training and testing alternate).
     """
+    if training.stop_rule == "solved" and not task.is_solvable:  # tests would end no training
+        training = dataclasses.replace(training, stop_rule="never")
     test = make_tester(agent, task, max(1, training.num_tests_between))
 
     def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:

@@ -230,8 +230,8 @@ def make_trainer(
     # A curve of tests may end at either limit.
     if test_fn is None and (proxy := proxy_in(env)) is not None:
         require_reachable("training", training, proxy.max_steps)
-    world = repeat_actions(env, agent.spec.action_repeat)
-    train = _Loop(agent, world, training, solved_reward, test_fn, keeps_stored).train
+    env = repeat_actions(env, agent.spec.action_repeat)
+    train = _Loop(agent, env, training, solved_reward, test_fn, keeps_stored).train
     if in_batches:
         train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
     return lambda key, env_params, hparams=None, active=True: train(
@@ -341,10 +341,10 @@ class _Loop:
             action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
-        num_steps = self.training.max_steps or LARGEST
+        most = self.training.max_steps or LARGEST
         if (proxy := proxy_in(self.env)) is not None:
-            num_steps = min(num_steps, self.training.max_episodes * proxy.max_steps)
-        return self.agent.buffer(jax.eval_shape(example), num_steps)
+            most = min(most, self.training.max_episodes * proxy.max_steps)
+        return self.agent.buffer(jax.eval_shape(example), most)
 
     def rollout(
         self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
@@ -357,12 +357,12 @@ class _Loop:
             large, stepped = self.step(large, state, consts, masked=True, learns=False)
             return large, jax.tree.map(partial(jnp.where, state.active), stepped, state)
 
-        num_steps = state.step
+        first_step = state.step
         large, state = jax.lax.fori_loop(0, length, step, (large, state))
         (stored, _), (key, _) = large, consts
         last = dataclasses.replace(state, step=state.step - 1)
         agent_state = jax.lax.cond(
-            (state.step == num_steps + length) & (state.episode >= self.agent.spec.learns_from),
+            (state.step == first_step + length) & (state.episode >= self.agent.spec.learns_from),
             partial(self.learn, stored, None, last, _StepKeys(*step_keys(key, last.step, 6))),
             lambda agent_state: agent_state,
             state.agent_state,
@@ -371,16 +371,16 @@ class _Loop:
 
     def learn(
         self,
-        arrays: PyTree,
+        stored: PyTree,
         transition: Transition | None,
         state: _LoopState,
         keys: _StepKeys,
         agent_state: AgentState,
     ) -> AgentState:
-        """One update, after the step that made `transition`."""
-        size = self.agent.batch_size(agent_state)
+        """One update, after `state.step`, which made `transition`; of a rollout it is None."""
+        in_use = self.agent.batch_size(agent_state)
         buffer = self.buffer(state)
-        batch = buffer.batch(keys.sample, arrays, state.step + 1, transition, size)
+        batch = buffer.batch(keys.sample, stored, state.step + 1, transition, in_use)
         return self.agent.update(keys.update, agent_state, batch)
 
     def step(

@@ -1,6 +1,7 @@
 """sejax.proxies.reward: the four rewards, what they leave unchanged, and RNs as proxies."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -236,15 +237,15 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
     agent = make_agent(config.agent, env.task, config.exploration)
     params = env.params(env.init_weights(jax.random.key(1)))
 
-    @jax.jit
-    def episodes(solved_reward):
+    @functools.partial(jax.jit, static_argnums=0)
+    def ended(solved_reward):
         task = dataclasses.replace(env.task, solved_reward=solved_reward)
-        evaluate = make_evaluator(agent, env, task, config.training)
-        return evaluate(jax.random.key(0), params).train_episodes
+        return make_evaluator(agent, env, task, config.training)(jax.random.key(0), params)
 
-    first_that_counts = agent.spec.warmup_episodes + 1
-    assert episodes(-1000.0) == first_that_counts
-    assert episodes(0.0) == config.training.max_episodes == 12
+    assert ended(-1000.0).train_episodes == agent.spec.warmup_episodes + 1
+    last, untested = ended(0.0), ended(np.inf)  # which no test would end
+    assert last.train_episodes == config.training.max_episodes == 12
+    assert untested.train_steps == last.train_steps and untested.real_steps < last.real_steps
 
 
 @pytest.mark.parametrize("objective", ["auc", "auc_sum"])

@@ -250,7 +250,7 @@ def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
     return hparams.replace(**values)
 
 
-class Learner(ABC):
+class Algorithm(ABC):
     """The pure functions of an agent; `agent` bundles them. Each algorithm is a subclass.
 
     The agent's state has the traced hyperparameters as `hparams`.

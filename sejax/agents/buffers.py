@@ -13,7 +13,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
-from sejax.ops.keys import murmur
+from sejax.ops.keys import WEYL, murmur
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
 T = TypeVar("T")
@@ -82,8 +82,8 @@ class Buffer:
       init: `() -> arrays`.
       store: `(arrays, step, transition, ended, active) -> arrays`; writes the `step`-th step, and
         nothing if `active` is False. `ended` says whether the episode ended with it.
-      batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
-        `num_steps` steps; `transition` is the last of them. If `batch_size` is not None, columns
+      batch: `(key, arrays, num_steps, transition, in_use) -> batch` for `Agent.update`, after
+        `num_steps` steps; `transition` is the last of them. If `in_use` is not None, columns
         from that number on have weight 0.
       learns_every: steps from one update to the next; above 1 `batch` gets None as `transition`.
     """
@@ -263,7 +263,7 @@ def sample_indices(
     size / 2**24.
     """
     counter = jnp.arange(batch_size, dtype=jnp.uint32)
-    x = murmur(seed + counter * jnp.uint32(0x9E3779B9))
+    x = murmur(seed + counter * jnp.uint32(WEYL))
     fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
     index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
     return jnp.minimum(index, size - 1)  # rounding may reach size

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PyTree
 
-from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Hparams, Learner
+from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops.networks import MLP
 from sejax.ops.optimizers import apply_gradient
@@ -78,7 +78,7 @@ class ActorCriticOptions(OffPolicyOptions):
         return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)
 
 
-class OffPolicy(Learner):
+class OffPolicy(Algorithm):
     """An agent that keeps its steps in a ring and learns from batches of them."""
 
     config: OffPolicyOptions

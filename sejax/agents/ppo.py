@@ -25,7 +25,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
@@ -163,7 +163,7 @@ class Batch(NamedTuple):
     returns: Steps
 
 
-class PPO(Learner):
+class PPO(Algorithm):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
     Parameters have the keys actor, critic and std. The actor's outputs are logits.

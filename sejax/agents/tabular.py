@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, Learner
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
 from sejax.envs.base import Task
@@ -85,7 +85,7 @@ class TabularState(struct.PyTreeNode):
     hparams: Hparams
 
 
-class Tabular(Learner):
+class Tabular(Algorithm):
     """The agent for observations `0..num_states-1` and actions `0..num_actions-1`.
 
     Example:

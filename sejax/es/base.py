@@ -13,7 +13,7 @@ from pydantic import Field
 from sejax.ops.scores import finite_mean
 from sejax.options import LEAST, Count, Options
 
-# A number of candidates, each with the weights of a proxy.
+# Perturbations (NES) or candidates (evosax's) of a generation.
 NumMembers = Annotated[int, Field(ge=2, le=100_000)]
 # Larger steps or noise lead to weights whose products are not finite.
 Scale = Annotated[float, Field(ge=LEAST, le=1e6)]

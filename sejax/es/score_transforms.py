@@ -1,4 +1,4 @@
-r"""Score transforms: from the candidates' scores K_i to their weights F_i; eight, or your own.
+r"""Score transforms: from the candidates' scores K_i to their weights F_i.
 
 Scores are maximised. A score that is not finite ranks below every finite one, or counts as the
 worst of them. Some transforms need a difference between candidates, or between a candidate and the

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-_WEYL = 0x9E3779B9  # 2**32 / golden ratio, odd: its multiples are spread evenly
+WEYL = 0x9E3779B9  # 2**32 / golden ratio, odd: its multiples are spread evenly
 
 
 def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
@@ -39,8 +39,8 @@ def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
     # Two chained accumulators, so that the state of a step has 64 bits.
     low, high = data[0], data[-1]
     low = _mix(low ^ _mix(jnp.uint32(step)))
-    high = _mix(high + low * jnp.uint32(_WEYL) + jnp.uint32(step))
-    count = (1 + jnp.arange(num * size, dtype=jnp.uint32)) * jnp.uint32(_WEYL)
+    high = _mix(high + low * jnp.uint32(WEYL) + jnp.uint32(step))
+    count = (1 + jnp.arange(num * size, dtype=jnp.uint32)) * jnp.uint32(WEYL)
     is_low = jnp.arange(num * size) % 2 == 0
     hashed = _mix(jnp.where(is_low, low, high) + count)
     keys = jax.random.wrap_key_data(hashed.reshape(num, size), impl=jax.random.key_impl(key))
@@ -59,6 +59,8 @@ def murmur(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
 
 def _mix(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
     """A bijection of 32 bits in which each bit of the input moves about half of the output.
+
+    It is no `murmur`, as all numbers were made with it.
 
     Source: C. Wellons, "Prospecting for hash functions" (2018), lowbias32.
     """

@@ -48,7 +48,7 @@ MOST, LEAST = 1e30, 1e-30  # of numbers in programs, which compute in 32 bits
 # --- errors --------------------------------------------------------------------------------------
 
 
-class Parts(TypedDict, total=False):
+class Details(TypedDict, total=False):
     """What follows a rule in a message.
 
     Attributes:
@@ -74,11 +74,11 @@ class ConfigError(ValueError):
         self.field = field
 
     @classmethod
-    def of(cls, field: str, message: str, **parts: Unpack[Parts]) -> Self:
+    def of(cls, field: str, message: str, **details: Unpack[Details]) -> Self:
         """The error that `require` raises with these arguments."""
-        got = f"; got {shortened(parts['got'])}" if "got" in parts else ""
-        fix = f"Set {field}={parts['use']}." if "use" in parts else parts.get("fix", "")
-        end = f". {fix}".rstrip() if parts else ""
+        got = f"; got {shortened(details['got'])}" if "got" in details else ""
+        fix = f"Set {field}={details['use']}." if "use" in details else details.get("fix", "")
+        end = f". {fix}".rstrip() if details else ""
         return cls(f"{field} {message}{got}{end}", field)
 
 
@@ -88,7 +88,7 @@ class FailedError(RuntimeError):
 
 @contextlib.contextmanager
 def errors_of(group: str, where: str) -> Iterator[None]:
-    """Errors in the block name a group by the place where it stands: `agents.ddqn` for `agent`."""
+    """Errors in the block say `where` in place of `group`, as `agents.ddqn` for `agent`."""
     try:
         yield
     except ConfigError as error:
@@ -99,14 +99,14 @@ def errors_of(group: str, where: str) -> Iterator[None]:
         raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
 
 
-def require(holds: object, field: str, message: str, **parts: Unpack[Parts]) -> None:
+def require(holds: object, field: str, message: str, **details: Unpack[Details]) -> None:
     """Raises `ConfigError` unless `holds`.
 
     Args:
       holds: what must be true.
       field: the field at fault.
-      message: the rule; without parts the whole message, to its full stop.
-      **parts: `got`, the value; and `use`, a value that holds, or `fix`, a sentence. See `Parts`.
+      message: the rule; without details the whole message, to its full stop.
+      **details: `got`, the value; and `use`, a value that holds, or `fix`. See `Details`.
 
     Example:
       >>> require(0 % 2, "es.population_size", "must be odd", got=0, use=1)
@@ -114,7 +114,7 @@ def require(holds: object, field: str, message: str, **parts: Unpack[Parts]) -> 
       sejax.options.ConfigError: es.population_size must be odd; got 0. Set es.population_size=1.
     """
     if not holds:
-        raise ConfigError.of(field, message, **parts)
+        raise ConfigError.of(field, message, **details)
 
 
 def require_package(field: str, package: str, extra: str) -> None:

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, PyTree
 from pydantic import Field
 
 from sejax.envs.base import Task
-from sejax.envs.environment import EnvParams, EnvState
+from sejax.envs.environment import EnvState
 from sejax.envs.spec import TaskSpec
 from sejax.ops.networks import MLP, uniform_fan_in
 from sejax.options import Activation, Count, Depth, require, require_known
-from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv
+from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams
 
 
 class Shaping(NamedTuple):
@@ -119,8 +119,7 @@ class RewardState(EnvState):
 
 
 @struct.dataclass
-class RewardParams(EnvParams):
-    weights: Any = None  # in the form of `init_weights`
+class RewardParams(ProxyParams):
     potentials: Array | None = None  # [num_states], if `prepare` found discrete states
     discount: Array | float = 1.0  # gamma; `prepare` puts the agent's here
     limit_is_terminal: Array | bool = False  # whether episodes end for the agent at the step limit

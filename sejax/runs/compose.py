@@ -1,9 +1,10 @@
 """From the words that a user types to nested plain values: the first half of `runs.config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts; `read` makes a tree of them, over the file that `preset=FILE.yaml` names. `runs.config` lays
-this tree over the layers below it: the choices that no word makes, and the preset, or the settings
-that a stored proxy was learned with. Names are checked later, when the tree becomes dataclasses.
+texts; `tree_of` makes a tree of them, over the file that `preset=FILE.yaml` names. `runs.config`
+lays this tree over the layers below it: the choices that no word makes, and the preset, or the
+settings that a stored proxy was learned with. Names are checked later, when the tree becomes
+dataclasses.
 
 sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has
 values, and more values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy
@@ -250,7 +251,7 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     agent.
 
     Args:
-      typed: see `read`, with the names of all agents.
+      typed: see `tree_of`, with the names of all agents.
       imports: each `module:attribute` that may be imported.
 
     Raises:

@@ -138,10 +138,10 @@ class RemoteChunks(Chunks):
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, which serve chunks of any length."""
-        self.compiled[length] = functools.partial(self._generations, *self._programs, length)
+        self.compiled[length] = functools.partial(self._generations, *self._program, length)
 
     @functools.cached_property
-    def _programs(self) -> tuple[Any, list[Outcome]]:
+    def _program(self) -> tuple[Any, list[Outcome]]:
         """The program of `ask` and `tell`, and the outcomes that it is given to ask.
 
         One program does both, and runs twice in a generation. In a program of `ask` alone, XLA
@@ -169,7 +169,7 @@ class RemoteChunks(Chunks):
     def _generations(
         self, generation: Any, no_outcomes: list[Outcome], length: int, state: LearnState
     ) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations with the compiled programs."""
+        """Runs `length` generations with the compiled program."""
         infos = []
         for _ in range(length):
             _, trainings = generation(state, no_outcomes)

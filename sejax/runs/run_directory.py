@@ -1,6 +1,6 @@
 """A run's folder, in which only `checkpoint.safetensors` counts.
 
-The checkpoint holds the configuration, the state of the learner, and all rows of `metrics.csv`; see
+The checkpoint holds the configuration, the state of the search, and all rows of `metrics.csv`; see
 `sejax.runs.store`. All other files are made again from it when the run resumes. A run that is
 refused changes nothing.
 """
@@ -47,7 +47,7 @@ State = TypeVar("State")
 class RunDirectory(Store):
     """One run's folder, which only this process may use within `with`.
 
-    Call `restore` once, then `save` after each block of generations.
+    Call `restore` once, then `save` after each chunk of generations.
 
     The stored configuration is compared as plain values: if only the folder names a module, it is
     not imported.
@@ -59,7 +59,7 @@ class RunDirectory(Store):
     Attributes:
       folder: new, or from an earlier session of the same run.
       settings: the configuration, plain values in nested mappings.
-      columns: the columns of `metrics.csv`; several agents have four more each.
+      columns: the columns of `metrics.csv`; several agents have `AGENT_COLUMNS` each.
       rows: the rows of `metrics.csv`, one for each saved generation, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
@@ -107,7 +107,7 @@ class RunDirectory(Store):
         return self.rows[-1][column] if self.rows else "0"
 
     def restore(self, like: State) -> State | None:
-        """Returns the checkpoint's state, and makes the other files again; None for a new run.
+        """Returns the checkpoint's state, and makes the tables again; None for a new run.
 
         Args:
           like: a state of the run, or its shapes.
@@ -129,11 +129,11 @@ class RunDirectory(Store):
     def save(
         self, state: PyTree[Array], info: GenerationInfo, wall_s: float, cpu_s: float
     ) -> list[dict[str, str]]:
-        """Writes the checkpoint after a block of generations, then the files made from it.
+        """Writes the checkpoint after a chunk of generations, then the files made from it.
 
         Args:
           state: pytree of arrays.
-          info: the block's info, leaves `[generation, ...]`; a generation counts if it is `active`.
+          info: the chunk's info, leaves `[generation, ...]`; a generation counts if it is `active`.
           wall_s: seconds of all sessions.
           cpu_s: CPU seconds of all sessions.
 
@@ -183,7 +183,7 @@ class RunDirectory(Store):
         self._tensors = tensors
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
-        """The rows of the active generations of a block."""
+        """The rows of the active generations of a chunk."""
         others = {"seed", "env_steps_total", "wall_s"}
         values = {name: np.asarray(vars(info)[name]) for name in COLUMNS if name not in others}
         steps = np.asarray(info.real_steps, np.int64).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The driver of a run: blocks of generations, each saved before the next one starts."""
+"""The driver of a run: chunks of generations, each saved before the next one starts."""
 
 import contextlib
 import dataclasses
@@ -114,7 +114,7 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgre
         if there != here:
             report.say(f"It was made with {there}; here are {here}. Numbers may move.")
         # `stop_when_solved` may have changed.
-        solved = jax.numpy.bool_(chunks.bilevel.is_solved(restored.best_score))
+        solved = jax.numpy.bool_(chunks.bilevel.ends_run(restored.best_score))
         state = dataclasses.replace(restored, solved=solved)
         save_proxies(directory, chunks.bilevel, jax.device_get(state), 0)
     # A copy has its own buffers, which can be donated.

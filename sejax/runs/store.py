@@ -59,7 +59,7 @@ class Store:
         self.settings: dict[str, Any] = json.loads(json.dumps(settings))
         self._field, self._free = field, free
         self._lock = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
-        self._is_used = False
+        self._has_entry = False
 
     def __enter__(self) -> Self:
         """Makes the folder and locks it; the lock ends with the process, even if it is killed.
@@ -80,7 +80,7 @@ class Store:
 
     def __exit__(self, *_: object) -> None:
         """Unlocks the folder; if it has no entry, removes what `with` has made."""
-        if self._lock.is_locked and not self._is_used:
+        if self._lock.is_locked and not self._has_entry:
             (self.folder / LOCK).unlink(missing_ok=True)
             remove_empty(self._new_folders)
         self._lock.release()
@@ -104,7 +104,7 @@ class Store:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self.damaged(name, error) from error
-        self._is_used = True
+        self._has_entry = True
         differing = differences(stored, self.settings, self._free)
         if differing:
             stored = self.completed(stored)
@@ -130,7 +130,7 @@ class Store:
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
         manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
         write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
-        self._is_used = True
+        self._has_entry = True
 
     def once(self, name: str, compute: Callable[[], Tensors]) -> dict[str, np.ndarray]:
         """The tensors of an entry; computes and writes them if there is none.
@@ -151,7 +151,7 @@ class Store:
 
     def damaged(self, name: str, error: Exception) -> ConfigError:
         """The error for an entry that cannot be read, with the reason."""
-        self._is_used = True
+        self._has_entry = True
         return self.refused(f"must hold whole files; got {self.file(name)}: {error}")
 
     def refused(self, message: str) -> ConfigError:
