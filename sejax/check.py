@@ -124,7 +124,9 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
     require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
     proxy, learned = loaded(config), dict[str, Any](config.agents)
-    task = proxy.task
+    task, is_rn = proxy.task, proxy.env.is_real
+    must = "must be proxy, as agents of a reward network train as on the task. Set real_training.*."
+    require(not is_rn or config.training_from == "proxy", "training_from", must)
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
     require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
@@ -136,6 +138,9 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     same = {registry.name_of("agent", agent) for agent in learned.values()}
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
+    typed_as = {key: config.field_of(key) for key in learned} | dict.fromkeys(others, "algorithms")
+    for key, field in typed_as.items():
+        agents.require_fit((learned | others)[key], config.exploration, task, task.name, field)
     myopic = dict[str, dict[str, AgentConfig]]()
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
     students = learned | others
@@ -157,6 +162,8 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
     store = Store(folder, settings, field="out_dir", free=FREE)
     with store, config.machines.pool() as pool:
+        if store.get("check") is None:  # whatever `num_agents` is, the settings stay the same
+            store.put("check")
         table, null = _trained(config, rows, store, pool), dict[str, Any]()
         rows, known = {}, [*learned, *others]
         if not proxy.env.is_real and task.num_states is None:
@@ -266,7 +273,7 @@ def _reported(
     record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
     with contextlib.suppress(OSError, ValueError):
         record = record or json.loads(proxy.path.with_name("run.json").read_text())
-    cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if x in record}
+    cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
     if cost:  # "never" if agents trained on the proxy do not reach the solved score
         saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"

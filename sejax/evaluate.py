@@ -186,7 +186,8 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     make = functools.partial(configuration.config, command=EvaluateConfig)
 
     def folder_of(config: EvaluateConfig, name: str = "") -> str:
-        parts = as_file_name(config.proxy), name
+        proxy = f"real-{config.env}" if config.proxy == "real" else config.proxy
+        parts = as_file_name(proxy), name
         return f"runs/evaluate-{'_'.join(filter(None, parts))}"
 
     configs = compose.swept(overrides, make, "out_dir", folder_of, known=("proxy",))
@@ -257,8 +258,7 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
         worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
         folder = proxy.path.parent
         if folder == header.PRETRAINED_DIR or hub.is_address(config.proxy):
-            name = as_file_name(config.proxy.removeprefix(hub.SCHEME))
-            folder = Path("runs", f"evaluate-{name}")
+            folder = Path("runs", f"evaluate-{as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
     if proxy is None or config.baseline:
         trainings = dict.fromkeys(trainings, real_training)
         worlds["the real task"] = World(task.env, task.params, task, trainings, is_varied)
@@ -278,8 +278,7 @@ def loaded(config: EvaluateConfig) -> Proxy:
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
         task = envs.make_from(configure("env", {**fields, "name": config.env}))
     if config.proxy_kind is not None:
-        fields = {**stored["proxy"], "name": config.proxy_kind}
-        proxy_config = configure("proxy", fields)
+        proxy_config = configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
     proxy = load_proxy(path, task, proxy_config, "proxy")
     name = proxy.task.name
     is_same = config.env in (None, name, proxy.config["env"].get("name"))

@@ -123,8 +123,7 @@ def make_tester(
       test_env: maps the task's environment, with the agent's action repeat, to the environment of
         the episodes; by default the same one.
     """
-    env = repeat_actions(task.env, agent.spec.action_repeat)
-    begin, decide = _greedy(agent, test_env(env))
+    begin, decide = _greedy(agent, test_env(repeat_actions(task.env, agent.spec.action_repeat)))
 
     def step(
         nothing: Array, state: _Episode, consts: PyTree, masked: bool

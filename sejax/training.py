@@ -337,8 +337,7 @@ class _Loop:
         """The agent's buffer."""
 
         def example() -> Transition:
-            act = self.agent.act
-            action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
+            action = self.agent.act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
         most = self.training.max_steps or LARGEST
@@ -379,8 +378,7 @@ class _Loop:
     ) -> AgentState:
         """One update, after `state.step`, which made `transition`; of a rollout it is None."""
         in_use = self.agent.batch_size(agent_state)
-        buffer = self.buffer(state)
-        batch = buffer.batch(keys.sample, stored, state.step + 1, transition, in_use)
+        batch = self.buffer(state).batch(keys.sample, stored, state.step + 1, transition, in_use)
         return self.agent.update(keys.update, agent_state, batch)
 
     def step(

@@ -65,8 +65,7 @@ def test_a_batch_in_use_is_the_beginning_of_the_whole_one(in_use):
 
 def test_a_full_buffer_overwrites_its_oldest_rows():
     # Capacity 5 after steps 0..7: rows hold steps 5, 6, 7, 3, 4.
-    actions = filled(8)[:, -3]
-    np.testing.assert_array_equal(actions, [5, 6, 7, 3, 4])
+    np.testing.assert_array_equal(filled(8)[:, -3], [5, 6, 7, 3, 4])
     batch = sample(filled(8), np.uint32(0), np.int32(8), 200)  # more steps than rows
     assert set(np.asarray(batch.action).tolist()) == {3, 4, 5, 6, 7}
 

@@ -127,7 +127,7 @@ def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     one, two = train(*calls[0]), train(*pickle.loads(pickle.dumps(calls[0])))  # as machines=ray
     np.testing.assert_array_equal(one["test_return"], two["test_return"])
     shutil.copytree(out, tmp_path / "other")
-    assert refused(run, path, out_dir=tmp_path / "other", seed=1) == "out_dir"
+    assert refused(run, path, out_dir=tmp_path / "other", seed=1, num_agents=9) == "out_dir"
     proxy = sejax.load_proxy(path)  # the same weights, but of another SE
     env = dataclasses.replace(proxy.env.config, min_steps=3).make(proxy.task)
     how = proxy.params.weights, proxy.config, proxy.discount
@@ -146,8 +146,8 @@ def test_a_reward_network_is_judged_by_training_steps(tmp_path):
 
 
 @pytest.mark.parametrize(("fields", "field"), [
-    ({"proxy": "nope"}, "proxy"), ({"proxy": "real"}, "proxy"), ({"agent": "ddqn"}, "agents.ddqn"),
-    ({"algorithms": "[td3]"}, "agents.td3"), ({"num_agents": 4}, "num_agents"),
+    ({"proxy": "nope"}, "proxy"), ({"proxy": "real"}, "proxy"), ({"agent": "ddqn"}, "agent"),
+    ({"algorithms": "[td3]"}, "algorithms"), ({"num_agents": 4}, "num_agents"),
     ({"baseline": "false"}, "baseline"), ({"agent_hparams": "varied"}, "agent_hparams"),
 ])  # fmt: skip
 def test_what_cannot_be_judged_is_refused(fields, field, whole, tmp_path, monkeypatch):

@@ -146,14 +146,14 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     configs = run.configs_of(["run_dir=", "seed=0,1"])  # an empty variable of a shell
-    assert [x.resolved_run_dir.name for x in configs] == [
-        "cartpole-se-ddqn-s0",
-        "cartpole-se-ddqn-s1",
-    ]
+    names = [x.resolved_run_dir.name for x in configs]
+    assert names == ["cartpole-se-ddqn-s0", "cartpole-se-ddqn-s1"]
     assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
     assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
     folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
     assert folders[1] == "runs/evaluate-cartpole_seed_2" and len({*folders}) == 4
+    (folder, _) = evaluate.configs_of(["proxy=real", "env=acrobot", "seed=1,2"])
+    assert folder.out_dir == "runs/evaluate-real-acrobot_seed_1"
     configs = evaluate.configs_of(["proxy=a/proxy.safetensors,a/proxy_last.safetensors"])
     assert len({x.out_dir for x in configs}) == 2
 

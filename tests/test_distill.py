@@ -105,6 +105,8 @@ def test_damaged_files_and_runs_of_another_command_are_refused(copied):
     assert refused(main, words) == "run_dir"
     (copied / "checkpoint.safetensors").unlink()
     assert refused(main, words) == "run_dir"  # it holds an SE
+    (copied / "proxy.safetensors").unlink()
+    assert refused(main, [*words, POLICY]) == "run_dir"  # and a search that may be unfinished
     (copied / "checkpoint.safetensors").write_bytes(b"")
     assert refused(main, words) == "run_dir"
 

@@ -109,8 +109,7 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
     summary = rn_curves.summarise(turned, max_steps=300)
     assert summary["steps_mean"].tolist() == [155, 185, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
-    alone = rn_curves.summarise(curves_of("icm", 2), max_steps=300)
-    assert alone["share_of_bare"].isna().all()
+    assert rn_curves.summarise(curves_of("icm", 2), max_steps=300)["share_of_bare"].isna().all()
 
 
 @pytest.mark.parametrize(("world", "groups", "drawn", "independent"), [

@@ -103,8 +103,7 @@ def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
     assert set(se_performance.select_best(agents)["group"]) == {"se1", "se2", "se3"}
     settings = se_performance.with_best(agents)["setting"].value_counts()
     assert settings.to_dict() == {"varied": 24, "best": 9}
-    alone = agents[agents["group"] == "se0"]
-    assert "best" not in set(se_performance.with_best(alone)["setting"])
+    assert "best" not in set(se_performance.with_best(agents[agents["group"] == "se0"])["setting"])
 
 
 @pytest.mark.slow

@@ -153,8 +153,7 @@ def test_a_shipped_ones_card_keeps_what_it_teaches(the_hub):
 
 
 def front_and_card(the_hub, repo):
-    text = the_hub.commits[repo][-1]["README.md"].decode()
-    empty, front, card = text.split("---\n", 2)
+    empty, front, card = the_hub.commits[repo][-1]["README.md"].decode().split("---\n", 2)
     assert not empty
     return yaml.safe_load(front), card.lstrip()
 

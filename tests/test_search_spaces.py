@@ -56,6 +56,7 @@ def test_what_cannot_be_searched_is_refused(text):
 
 def test_overrides_are_the_searchs_own_the_space_or_fixed():
     words = ["env=acrobot", "es.noise_std=interval(0.1, 1)", "trials=7", "study=2024-01-01"]
+    assert search_config.plan_of(["es.noise_std=0.1,1", "es.step_size=1,2", "es.noise_std=3"]).fixed
     search = search_config.plan_of(words)
     assert search.fixed == ("env=acrobot",) and list(search.space) == ["es.noise_std"]
     assert (search.config.trials, search.study) == (7, "2024-01-01")
@@ -106,7 +107,8 @@ def test_every_preset_names_fields_with_bounds_that_are_accepted(name, words):
     ("trials=0", "trials"), ("max_generations=2", "max_generations"), ("space=papr_se", "space"),
     ("generations=5", "generations"), ("machines.workers=2", "machines.workers"),
     ("sampler=random", "sampler"), ("proxy=cartpole", "proxy"), ("es.a=1,2", "es.a"),
-    ("trials=1,2", "trials"),
+    ("trials=1,2", "trials"), ("seed=0,1", "seed"), ("generations=choice(1, 2)", "generations"),
+    ("es.population_size=tag(log, interval(2, 6))", "es.population_size"),
 ])  # fmt: skip
 def test_bad_overrides_are_refused(word, field):
     assert refused(search_config.plan_of, ["es.noise_std=0.1,0.2", word]) == field

@@ -42,6 +42,7 @@ USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "
 # The default students and how many steps they train, by kind of actions.
 STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
 STEPS = {"continuous": 10_000, "discrete": 2000}
+BEGUN = "begun"  # the entry of a search that may be unfinished
 CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
 CHOOSE, TEST = "choose", "test"  # what students are for
 
@@ -81,8 +82,7 @@ class DistillConfig(LearnConfig):
         env = configuration.env_in(typed.get("env", {}), imports)
         actions = envs.spec_of(env).actions
         if not compose.names_of(typed["agents"]):
-            students = {name: {"name": name} for name in STUDENTS[actions]}
-            typed = merge(typed, {"agents": students})
+            typed = merge(typed, {"agents": {name: {"name": name} for name in STUDENTS[actions]}})
         # An episode of a one-step SE has one step.
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
         lengths = {"max_steps": steps, "max_episodes": steps}
@@ -159,6 +159,7 @@ def distill(config: DistillConfig, words: str = "") -> Path:
     """
     with Store(config.resolved_run_dir, settings_of(config)) as store:
         is_new = store.get(CHECKPOINT) is None  # raises for a folder of another command
+        store.get(BEGUN)  # raises for other settings
         if is_new and (store.folder / "proxy.safetensors").exists():
             raise store.refused(f"must hold no SE of another command; got {store.folder}")
         return _distilled(config, store, words)
@@ -170,6 +171,7 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if config.policy is None:
+        store.put(BEGUN)
         shared = config.num_snapshots, keys, store, config.devices
         lessons, costs = search_policies(config.search, task, *shared)
         write_text(folder / "search.csv", costs.to_csv(index=False))

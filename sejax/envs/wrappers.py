@@ -157,8 +157,7 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
         self.spaces = observation, action = spaces
         self._bounds = None
         if isinstance(action, Box):
-            bounds = np.array([action.low, action.high], np.float32)
-            self._bounds = bounds.reshape(2, *action_shape)
+            self._bounds = np.array([action.low, action.high], np.float32).reshape(2, *action_shape)
             self.spaces = observation, Box.symmetric(*[1.0] * action.size)
 
     def reset_env(self, key: Array, params: EnvParams) -> tuple[Array, EnvState]:

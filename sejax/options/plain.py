@@ -64,8 +64,7 @@ def to_plain(value: object, group: str | None = None) -> Any:
 
 def plugin(group: str) -> Any:
     """A dataclass field with a plugin's configuration; the default is sejax's own first one."""
-    first = {"name": next(iter(registry.BUILT_IN[group]))}
-    factory = functools.partial(configure, group, first)
+    factory = functools.partial(configure, group, {"name": next(iter(registry.BUILT_IN[group]))})
     return dataclasses.field(default_factory=factory, metadata={"plugin": group})
 
 

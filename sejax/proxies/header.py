@@ -59,8 +59,7 @@ class Header:
     def __post_init__(self) -> None:
         config = old.of_today(self.config)
         object.__setattr__(self, "config", config)
-        agents = dict(config["agents"]).values()
-        parts = [config["env"], config["proxy"], *agents, *self.proxies]
+        parts = [config["env"], config["proxy"], *config["agents"].values(), *self.proxies]
         is_whole = self.proxies and all(isinstance(part, Mapping) for part in parts)
         if self.format_version != FORMAT_VERSION or not is_whole:
             raise ValueError(f"format {self.format_version}, or a part that is missing")

@@ -428,8 +428,7 @@ def load_set(
     path, tensors, learned = stored
     if not learned.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    fix = "a file that sejax has written"
-    _require_weights(option, tensors, env, len(learned.proxies), fix)
+    _require_weights(option, tensors, env, len(learned.proxies), "a file that sejax has written")
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),

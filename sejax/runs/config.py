@@ -79,8 +79,7 @@ class CommandConfig(Options):
     @classmethod
     def groups(cls) -> list[str]:
         """The groups of plugins that the command's fields hold, each one; not the agents'."""
-        fields = dataclasses.fields(cls)
-        return [x.name for x in fields if x.metadata.get("plugin") == x.name]
+        return [x.name for x in dataclasses.fields(cls) if x.metadata.get("plugin") == x.name]
 
     @classmethod
     @abstractmethod
@@ -228,8 +227,7 @@ class LearnConfig(CommandConfig):
         require(are_some, "mixture.weights", "must have one above 0. Leave one of them out.")
         object.__setattr__(self, "mixture", dataclasses.replace(self.mixture, weights=weights))
         for key, agent in self.agents.items():
-            field = self.field_of(key)
-            agents.require_fit(agent, self.exploration, spec, task_name, field)
+            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     def name(self, group: str) -> str:
@@ -353,8 +351,7 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]
     sources = dict[str, str]()
     for layer, tree in layers.items():
-        source = "" if layer == "default" else f" ({layer})"
-        sources |= dict.fromkeys(config.named(tree), source)
+        sources |= dict.fromkeys(config.named(tree), "" if layer == "default" else f" ({layer})")
     named = (*choices, *map(config.field_of, config.agents))
     fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
     return "\n".join([*lines, field_lines(fields, classes, sources)])

@@ -173,8 +173,7 @@ class RemoteChunks(Chunks):
         infos = []
         for _ in range(length):
             _, trainings = generation(state, no_outcomes)
-            outcomes = self._evaluate(jax.device_get(trainings))
-            (state, info), _ = generation(state, outcomes)
+            (state, info), _ = generation(state, self._evaluate(jax.device_get(trainings)))
             infos.append(info)
         return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *infos)
 

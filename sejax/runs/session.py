@@ -56,8 +56,7 @@ def run(
     agents = sum(bilevel.evaluate.num_trainings)  # of a generation
     folder, first = directory.folder.resolve(), len(directory.rows)
     run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
-    guarded = GuardedTracker(config.tracker, run, report.say)
-    with contextlib.closing(guarded) as tracker:
+    with contextlib.closing(GuardedTracker(config.tracker, run, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
             if first and all(float(x["num_nonfinite"]) == agents for x in directory.rows):
                 break  # every agent of every generation has diverged

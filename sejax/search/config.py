@@ -6,6 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from optuna.distributions import FloatDistribution as Real
+
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
 from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
@@ -17,6 +19,8 @@ from sejax.search import spaces
 REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.
 SET_BY_SEARCH = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
+# Fields that a search cannot vary: scores would not compare, or not depend on them.
+ONE_VALUE = ("env", "proxy", "objective", "seed", "tracker", "devices", "num_parallel")
 # Names, and fields that may differ between the workers of a study and between its sessions.
 FREE = ("trials", "search_dir", "verify", "fresh_seeds", "space", "devices")
 
@@ -121,11 +125,15 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     Raises:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
-    pairs = (override.partition("=") for override in overrides)
-    searched = ((x, text) for x, _, text in pairs if x not in fields_of(StudyConfig))
-    ranges = {name: text for name, text in searched if spaces.is_range(text)}
-    rest = [override for override in overrides if override.partition("=")[0] not in ranges]
+    by_name = {override.partition("=")[0]: override for override in overrides}  # the last counts
+    searched = by_name.keys() - fields_of(StudyConfig).keys()
+    texts = {name: x.partition("=")[2] for name, x in by_name.items() if name in searched}
+    ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
+    rest = [override for name, override in by_name.items() if name not in ranges]
     own, others = compose.partition(rest, StudyConfig)
+    for name, text in ranges.items():
+        must = "must be one value in a search"
+        require(name not in ONE_VALUE, name, must, got=text, use="VALUE")
     for name, text in (ranges | others).items():
         must = "must be left out, as the search sets it"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
@@ -144,6 +152,10 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     fields = default.named(default.plain())
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
+    for name, x in space.items():
+        is_fit = type(fields[name]) is not int or not isinstance(x.distribution, Real)
+        use = f"'{x.text.replace('interval(', 'int(interval(').replace(')', '))', 1)}'"
+        require(is_fit, name, "must be whole numbers", got=x.text, use=use)
     must = "must be given and have ranges for these agents, or fields must have some; got none"
     require(space, "space", must, use=f"paper_se, or es.noise_std='{spaces.EXAMPLE}'")
     return search
