@@ -74,7 +74,7 @@ nitpick_ignore_regex = [
     ),
     (
         "py:class",
-        r"sejax\.(options\.(T|Parts|registry\.(T|Makes))|scoring\.Scoring|evaluation\.Tests"
+        r"sejax\.(options\.(T|Details|registry\.(T|Makes))|scoring\.Scoring|evaluation\.Tests"
         r"|ops\.networks\.MLP|runs\.store\.Store)",
     ),
 ]
