@@ -138,12 +138,12 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     same = {registry.name_of("agent", agent) for agent in learned.values()}
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
-    typed_as = {key: config.field_of(key) for key in learned} | dict.fromkeys(others, "algorithms")
-    for key, field in typed_as.items():
-        agents.require_fit((learned | others)[key], config.exploration, task, task.name, field)
+    students = learned | others
+    for key, agent in students.items():
+        field = config.field_of(key) if key in learned else "algorithms"
+        agents.require_fit(agent, config.exploration, task, task.name, field)
     myopic = dict[str, dict[str, AgentConfig]]()
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
-    students = learned | others
     for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
         sighted = {
             f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
@@ -162,8 +162,7 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
     store = Store(folder, settings, field="out_dir", free=FREE)
     with store, config.machines.pool() as pool:
-        if store.get("check") is None:  # whatever `num_agents` is, the settings stay the same
-            store.put("check")
+        store.once("check", dict)  # settings are compared, whatever `num_agents` is
         table, null = _trained(config, rows, store, pool), dict[str, Any]()
         rows, known = {}, [*learned, *others]
         if not proxy.env.is_real and task.num_states is None:

@@ -32,6 +32,7 @@ from sejax.options import (
 T = typing.TypeVar("T")
 
 MISSING = dataclasses.MISSING
+NAMED = 2  # fields of a message about settings that differ
 # Our names of fields, by the names that others use.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
@@ -125,8 +126,8 @@ def from_plain(
         of_field = marks(cls, name)
         if isinstance(value, str | bytes) and ":" in str(value) and of_field.get("names_code"):
             registry.require_typed(full[name], str(value), imports)
-        at = _Place(full[name], defaults[name], of_field.get("plugin"), imports)
-        fields[name] = _read(value, hints[name], at)
+        field = _Field(full[name], defaults[name], of_field.get("plugin"), imports)
+        fields[name] = _read(value, hints[name], field)
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
         require(is_known, full[name], "must be given; it has no default", use="VALUE")
@@ -153,8 +154,8 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     return ConfigError.of(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
-class _Place(typing.NamedTuple):
-    """The field that a value is for: its full name, its default, its group if it holds plugins."""
+class _Field(typing.NamedTuple):
+    """A field: its full name, its default, and its group if it holds plugins."""
 
     name: str
     default: Any
@@ -162,27 +163,27 @@ class _Place(typing.NamedTuple):
     imports: Collection[str] | None  # each `module:attribute` that may be imported; None: any
 
 
-def _read(value: Any, hint: Any, at: _Place) -> Any:
+def _read(value: Any, hint: Any, field: _Field) -> Any:
     """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf."""
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
-        names = {key: f"{at.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
-        places = {key: at._replace(name=x, default=MISSING) for key, x in names.items()}
-        return {str(key): _read(value[key], of_key, place) for key, place in places.items()}
-    if at.group:
-        if isinstance(value, Mapping) and at.default is not MISSING:
-            value = {"name": registry.name_of(at.group, at.default), **value}
-        with errors_of(at.group, at.name):
-            return configure(at.group, value, at.imports)
+        names = {key: f"{field.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
+        fields = {key: field._replace(name=x, default=MISSING) for key, x in names.items()}
+        return {str(key): _read(value[key], of_key, one) for key, one in fields.items()}
+    if field.group:
+        if isinstance(value, Mapping) and field.default is not MISSING:
+            value = {"name": registry.name_of(field.group, field.default), **value}
+        with errors_of(field.group, field.name):
+            return configure(field.group, value, field.imports)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
-        must = f"must have fields, as {at.name}.{next(iter(fields_of(hint)), 'name')}"
-        require(isinstance(value, Mapping), at.name, must, got=repr(value), fix="Leave it out.")
-        base = to_plain(at.default) if isinstance(at.default, hint) else {}
-        return from_plain(hint, base | value, at.name, at.imports)
-    return _leaf(value, hint, at)
+        must = f"must have fields, as {field.name}.{next(iter(fields_of(hint)), 'name')}"
+        require(isinstance(value, Mapping), field.name, must, got=repr(value), fix="Leave it out.")
+        base = to_plain(field.default) if isinstance(field.default, hint) else {}
+        return from_plain(hint, base | value, field.name, field.imports)
+    return _leaf(value, hint, field)
 
 
-def _leaf(value: Any, hint: Any, at: _Place) -> Any:
+def _leaf(value: Any, hint: Any, field: _Field) -> Any:
     """A number, a text or a list, which may stand as an override's text: read, or else as it is."""
     reading = value
     if isinstance(value, str):
@@ -191,8 +192,8 @@ def _leaf(value: Any, hint: Any, at: _Place) -> Any:
     elif type(value) in (int, float):
         value = str(value)  # it may be a name of digits, such as a folder's
     with suppress(ConfigError):
-        return checked(reading, hint, at.name, at.default)
-    return checked(value, hint, at.name, at.default)
+        return checked(reading, hint, field.name, field.default)
+    return checked(value, hint, field.name, field.default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------
@@ -218,7 +219,7 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differences(
-    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 2
+    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = ()
 ) -> str:
     """The fields in which two nested settings differ, for a message; empty if they are equal.
 
@@ -226,7 +227,6 @@ def differences(
       there: settings that were stored.
       here: settings that the user asks for.
       free: groups and fields of the first level that may differ.
-      most: how many fields are named at most.
 
     Example:
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
@@ -239,9 +239,9 @@ def differences(
     names = [x for x in names if x.endswith(".name") or x.rpartition(".")[0] not in choices]
     texts = [
         f"{name} ({shortened(old.get(name), 60)} there, {shortened(new.get(name), 60)} here)"
-        for name in names[:most]
+        for name in names[:NAMED]
     ]
-    return ", ".join(texts) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return ", ".join(texts) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
 # --- texts ---------------------------------------------------------------------------------------

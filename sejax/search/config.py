@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from optuna.distributions import FloatDistribution as Real
+from optuna.distributions import FloatDistribution
 
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
@@ -153,7 +153,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     for name in space.keys() - fields.keys():
         raise unknown_field(name, fields)
     for name, x in space.items():
-        is_fit = type(fields[name]) is not int or not isinstance(x.distribution, Real)
+        is_fit = type(fields[name]) is not int or not isinstance(x.distribution, FloatDistribution)
         use = f"'{x.text.replace('interval(', 'int(interval(').replace(')', '))', 1)}'"
         require(is_fit, name, "must be whole numbers", got=x.text, use=use)
     must = "must be given and have ranges for these agents, or fields must have some; got none"
