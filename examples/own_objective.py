@@ -1,4 +1,4 @@
-"""An objective of one's own: synthetic environments whose agents can be relied on.
+"""An objective of one's own: the mean test return, less the deviation between test episodes.
 
     python own_objective.py
     python -m sejax.run env=cartpole objective=own_objective:RiskAverse    # in this folder

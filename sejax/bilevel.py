@@ -248,12 +248,7 @@ def make_bilevel(
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, mean.size)
-    asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
-    size = strategy.population_size
-    must = f"must ask for population_size vectors of {mean.size} numbers, in pairs if antithetic"
-    is_whole = asked.shape == (size, mean.size) and not (strategy.antithetic and size % 2)
-    got = f"{asked.shape}, population_size={size}, antithetic={strategy.antithetic}"
-    require(is_whole, "es", must, got=got)
+    _require_population(strategy, mean)
     scoring = Scoring.of(objective, strategy, Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,
@@ -266,3 +261,13 @@ def make_bilevel(
     must = "must be false, as scores of this objective and task cannot say solved; got true."
     require(not stop_when_solved or bilevel.solved_score is not None, "stop_when_solved", must)
     return bilevel
+
+
+def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None:
+    """Checks that a strategy, which may be the user's own, asks for the population that it says."""
+    asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
+    size = strategy.population_size
+    must = f"must ask for population_size vectors of {mean.size} numbers, in pairs if antithetic"
+    is_whole = asked.shape == (size, mean.size) and not (strategy.antithetic and size % 2)
+    got = f"{asked.shape}, population_size={size}, antithetic={strategy.antithetic}"
+    require(is_whole, "es", must, got=got)

@@ -32,7 +32,7 @@ from pydantic import Field
 from sejax import agents
 from sejax.agents.base import AgentConfig
 from sejax.distill.policies import CopyConfig, copy_policy
-from sejax.distill.policy_search import SearchConfig, search_policies
+from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted
 from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
@@ -122,18 +122,8 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
 def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
-    require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
-    proxy, learned = loaded(config), dict[str, Any](config.agents)
-    task, is_rn = proxy.task, proxy.env.is_real
-    must = "must be proxy, as agents of a reward network train as on the task. Set real_training.*."
-    require(not is_rn or config.training_from == "proxy", "training_from", must)
-    jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
-    require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
-    require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
-    have_one = all(hasattr(agent, "discount") for agent in learned.values())
-    require(have_one, "agent", f"must have a discount; got {', '.join(learned)}. Set agent=NAME.")
-    zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
-    require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
+    proxy, learned = _judgeable(config), dict[str, Any](config.agents)
+    task = proxy.task
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     same = {registry.name_of("agent", agent) for agent in learned.values()}
     with errors_of("agent", "algorithms"):
@@ -176,6 +166,25 @@ def findings(config: CheckConfig) -> dict[str, Any]:
         return _reported(proxy, null, [*learned], table, folder)
 
 
+def _judgeable(config: CheckConfig) -> Proxy:
+    """The proxy, if all that a check needs is there; else it raises `ConfigError`."""
+    require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
+    proxy = loaded(config)
+    task = proxy.task
+    must = "must be proxy, as agents of a reward network train as on the task. Set real_training.*."
+    is_idle = proxy.env.is_real and config.training_from != "proxy"
+    require(not is_idle, "training_from", must)
+    jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
+    require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
+    require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
+    have_one = all(hasattr(agent, "discount") for agent in config.agents.values())
+    got = ", ".join(config.agents)
+    require(have_one, "agent", "must have a discount", got=got, fix="Set agent=NAME.")
+    zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
+    require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
+    return proxy
+
+
 # --- who trains where -----------------------------------------------------------------------------
 
 
@@ -215,10 +224,10 @@ def _null(
     """
     uses = ("search", "test", "record")
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), 3), strict=True))
-    # A generation has 2 * 16 + 1 episodes and 10 tests.
-    generations = max(1, config.null_steps // (43 * task.max_steps))
+    num_episodes = 2 * ARS["num_directions"] + 1 + ARS["num_tests"]  # of a generation
+    generations = max(1, config.null_steps // (num_episodes * task.max_steps))
     fields = ARS | {"alive_bonus": dict[str, Any](task.origin or {}).get("healthy_reward", 0.0)}
-    search = SearchConfig(**fields, generations=generations, until_solved=True)
+    search = PolicySearchConfig(**fields, generations=generations, until_solved=True)
     (lesson,), costs = search_policies(search, task, 1, keys, store, config.devices)
     method, steps = "a random search", costs["real_steps"].sum()
     if lesson.policy_return < task.solved_reward:

@@ -184,16 +184,17 @@ def help_text(overrides: Sequence[str]) -> str:
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     make = functools.partial(configuration.config, command=EvaluateConfig)
-
-    def folder_of(config: EvaluateConfig, name: str = "") -> str:
-        proxy = f"real-{config.env}" if config.proxy == "real" else config.proxy
-        parts = as_file_name(proxy), name
-        return f"runs/evaluate-{'_'.join(filter(None, parts))}"
-
-    configs = compose.swept(overrides, make, "out_dir", folder_of, known=("proxy",))
+    configs = compose.swept(overrides, make, "out_dir", _folder_of, known=("proxy",))
     if len(configs) == 1:
         return configs
-    return [dataclasses.replace(x, out_dir=x.out_dir or folder_of(x)) for x in configs]
+    return [dataclasses.replace(x, out_dir=x.out_dir or _folder_of(x)) for x in configs]
+
+
+def _folder_of(config: EvaluateConfig, name: str = "") -> str:
+    """The default folder on the real task, of a shipped proxy or one of the Hub, and in sweeps."""
+    is_real, proxy = config.proxy == "real", config.proxy.removeprefix(hub.SCHEME)
+    folder = f"runs/evaluate-{as_file_name(f'real-{config.env}' if is_real else proxy)}"
+    return f"{folder}_{name}" if name else folder
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -253,12 +254,11 @@ def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
     is_varied = config.agent_hparams == "varied"
     if proxy is not None and config.agent_hparams == "as_learned":
         is_varied = proxy.config.get("agent_hparams") == "varied"
-    worlds, folder = {}, Path("runs", f"evaluate-real-{as_file_name(task.name)}")
+    worlds, folder = {}, Path(_folder_of(config))
     if proxy is not None:
         worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
-        folder = proxy.path.parent
-        if folder == header.PRETRAINED_DIR or hub.is_address(config.proxy):
-            folder = Path("runs", f"evaluate-{as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
+        if proxy.path.parent != header.PRETRAINED_DIR and not hub.is_address(config.proxy):
+            folder = proxy.path.parent
     if proxy is None or config.baseline:
         trainings = dict.fromkeys(trainings, real_training)
         worlds["the real task"] = World(task.env, task.params, task, trainings, is_varied)

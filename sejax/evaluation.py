@@ -136,8 +136,7 @@ def make_tester(
     def episode(key: Array, agent_state: AgentState, active: Array | bool, params: PyTree) -> Tests:
         key_reset, key_steps = jax.random.split(key)
         state = begin(key_reset, active, task.params if params is None else params)
-        consts = (key_steps, agent_state, params)
-        _, state = while_any_active(step, jnp.zeros(0), state, consts)
+        _, state = while_any_active(step, jnp.zeros(0), state, (key_steps, agent_state, params))
         return Tests(state.total, state.num_steps, state.scored)
 
     def test(

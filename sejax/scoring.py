@@ -1,8 +1,9 @@
 """From the outcomes of a generation to the scores of its candidates.
 
 `Scoring` applies an objective to both groups of a generation, the population and the incumbent. It
-gives the scores that the strategy compares and the scores that people see. These differ only with a
-mixture of agents, or if a curriculum (`MaxReward.first_eval_steps`) scores a part of each episode.
+gives the scores that the strategy compares, one for each candidate, and the scores that people see,
+one for each training. A mixture puts the first ones in one unit. An objective may also show people
+another score (`Objective.shown`), as `MaxReward.first_eval_steps` does.
 """
 
 import dataclasses

@@ -174,7 +174,7 @@ def make_trainer(
     keeps_stored: bool = False,
     in_batches: bool = True,
 ) -> Callable[..., TrainResult]:
-    """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
+    """Builds `train(key, env_params, hparams=None, active=True) -> TrainResult` for one agent.
 
     `train` is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
     agents takes as many steps as its longest training, without copies of replay buffers. With

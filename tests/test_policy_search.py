@@ -13,7 +13,7 @@ from sejax import envs
 from sejax.distill.policies import CopyConfig, acting, copy_policy, erring, visit
 from sejax.distill.policy_search import (
     Policy,
-    SearchConfig,
+    PolicySearchConfig,
     linear_act,
     make_search,
     step_size,
@@ -24,7 +24,7 @@ from sejax.envs.wrappers import Wrapper
 from sejax.runs.store import Store
 
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
-SMALL = SearchConfig(num_directions=6, num_top=3, generations=10, num_tests=4)
+SMALL = PolicySearchConfig(num_directions=6, num_top=3, generations=10, num_tests=4)
 RNG = np.random.default_rng(1)
 
 
@@ -76,7 +76,7 @@ def test_layers_do_what_the_policy_does(task):
 
 
 def test_the_step_size_declines_in_the_second_half():
-    config = SearchConfig(generations=100, step_size=0.5)
+    config = PolicySearchConfig(generations=100, step_size=0.5)
     sizes = [float(step_size(config, i)) for i in (0, 49, 75, 99)]
     np.testing.assert_allclose(sizes, [0.5, 0.5, 0.25, 0.05], rtol=1e-6)
 

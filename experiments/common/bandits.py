@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 import sejax
 from sejax.check import ARS
-from sejax.distill.policy_search import Policy, SearchConfig, linear_act, make_search
+from sejax.distill.policy_search import Policy, PolicySearchConfig, linear_act, make_search
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_fixed, make_recorder, make_tester
@@ -196,7 +196,7 @@ def search_teacher(task: Task, real_steps: int, seed: int) -> Teacher:
 @functools.cache
 def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
     """The linear policy as an agent, one that does nothing, and a compiled, tested generation."""
-    search = make_search(SearchConfig(**ARS), task)
+    search = make_search(PolicySearchConfig(**ARS), task)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
 
     def generation(key: Array, policy: Policy) -> tuple[Policy, Array, Any]:

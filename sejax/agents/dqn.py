@@ -206,5 +206,4 @@ def double_q_targets(
 
     Source: van Hasselt et al. (2016), eq. 4.
     """
-    best = jnp.argmax(online_next_q, axis=0)
-    return reward + discount * select_action(target_next_q, best)
+    return reward + discount * select_action(target_next_q, jnp.argmax(online_next_q, axis=0))

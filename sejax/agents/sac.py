@@ -276,8 +276,7 @@ class DiscreteSAC(SAC):
         return LearningNoise(None, None)
 
     def sample(self, key: Array, outputs: Array, is_uniform: Array) -> Array:
-        logits = jnp.where(is_uniform, 0.0, outputs)
-        return jax.random.categorical(key, logits).astype(jnp.int32)
+        return jax.random.categorical(key, jnp.where(is_uniform, 0.0, outputs)).astype(jnp.int32)
 
     def best(self, outputs: Array) -> Array:
         return jnp.argmax(outputs).astype(jnp.int32)

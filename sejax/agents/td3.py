@@ -239,8 +239,7 @@ class TD3(ActorCritic):
         """
         hp, clip = state.hparams, state.hparams.target_noise_clip
         smoothing = jnp.clip(hp.target_noise_std * noise.smoothing, -clip, clip)
-        outputs = self.outputs(state.target_actor, obs)
-        action = self.action(outputs, noise.target_policy, state)
+        action = self.action(self.outputs(state.target_actor, obs), noise.target_policy, state)
         return self.restrict(action + self.max_action * smoothing)
 
     # Methods that discrete actions override.

@@ -147,5 +147,4 @@ def _with_variants(agent: Agent, used: tuple[int, ...]) -> Agent:
         variant, hparams, values = draw(key)
         return jnp.searchsorted(jnp.array(used), variant), hparams, values
 
-    varied = Varied(tuple(variants[i] for i in used), draw_used)
-    return dataclasses.replace(agent, varied=varied)
+    return dataclasses.replace(agent, varied=Varied(tuple(variants[i] for i in used), draw_used))

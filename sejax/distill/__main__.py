@@ -23,7 +23,7 @@ import pandas as pd
 
 from sejax import envs
 from sejax.distill.policies import CopyConfig, copy_policy
-from sejax.distill.policy_search import SearchConfig, search_policies
+from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, field_lines, option, require, shortened
@@ -66,7 +66,7 @@ class DistillConfig(LearnConfig):
 
     policy: str | None = option(None, names_code=True)
     copy: CopyConfig = CopyConfig()
-    search: SearchConfig = SearchConfig()
+    search: PolicySearchConfig = PolicySearchConfig()
     independent_starts: bool = False
     num_snapshots: Count = 6
     num_students: Count = 4
@@ -121,7 +121,7 @@ def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     plain = flatten(config_of(overrides).plain())
     values = {name: x for name, x in plain.items() if name.partition(".")[0] in OWN}
-    classes = [("", DistillConfig), ("copy", CopyConfig), ("search", SearchConfig)]
+    classes = [("", DistillConfig), ("copy", CopyConfig), ("search", PolicySearchConfig)]
     return f"{__doc__}\nIts own fields, with their values:\n{field_lines(values, classes, {})}"
 
 

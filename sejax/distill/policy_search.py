@@ -40,7 +40,7 @@ COLUMNS = ("start", "generation", "test_mean", "test_std", "real_steps", "cpu_s"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchConfig(Options):
+class PolicySearchConfig(Options):
     """How a linear policy is searched. Its weights map observations with mean 0, variance 1 to
     actions in units of the task's bound.
 
@@ -138,7 +138,7 @@ def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Arr
     return task.max_action * jnp.clip(outputs, -1.0, 1.0)
 
 
-def make_search(config: SearchConfig, task: Task, devices: int | None = None) -> Search:
+def make_search(config: PolicySearchConfig, task: Task, devices: int | None = None) -> Search:
     """Builds the functions of a search.
 
     Args:
@@ -152,7 +152,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
     Example:
       >>> import sejax
       >>> task = sejax.envs.make("mountain_car")
-      >>> search = make_search(SearchConfig(num_directions=4, num_top=2), task, devices=1)
+      >>> search = make_search(PolicySearchConfig(num_directions=4, num_top=2), task, devices=1)
       >>> policy, returns, _ = jax.eval_shape(
       ...     search.generation, jax.random.key(0), search.init(), 0)
       >>> policy.weights.shape, returns.shape
@@ -213,7 +213,7 @@ def random_map(key: Array, shape: tuple[int, ...]) -> Float[Array, "... inputs"]
     return scale * jax.random.normal(key, shape)
 
 
-def step_size(config: SearchConfig, number: Array | int) -> Array:
+def step_size(config: PolicySearchConfig, number: Array | int) -> Array:
     """The step size of a generation: constant at first, then a straight line to a tenth."""
     first = config.constant * config.generations
     left = (config.generations - number) / max(config.generations - first, 1.0)
@@ -249,7 +249,7 @@ class Lesson(NamedTuple):
 
 
 def search_policies(
-    options: SearchConfig,
+    config: PolicySearchConfig,
     task: Task,
     num_lessons: int,
     keys: dict[str, Array],
@@ -259,7 +259,7 @@ def search_policies(
     """The best tested policy of each of `num_lessons` equal parts of a search.
 
     Args:
-      options: the search's configuration.
+      config: the search's configuration.
       task: the real task.
       num_lessons: number of parts; fewer if fewer policies are tested.
       keys: `search`, `test` and `record`.
@@ -269,13 +269,13 @@ def search_policies(
     Returns:
       The lessons, and a row of `COLUMNS` for each policy that was tested.
     """
-    search = Search(*(jax.jit(function) for function in make_search(options, task, devices)))
+    search = Search(*(jax.jit(function) for function in make_search(config, task, devices)))
     rows: list[Arrays] = []  # of tested policies, in their order
 
     def climb(start: int, first: int, policy: Policy) -> Arrays:
         """The policy after the generations from `first` up to its next test, and its row."""
         started, num_steps = time.process_time(), 0
-        last = min(first + options.test_every, options.generations)
+        last = min(first + config.test_every, config.generations)
         key_search, key_test = (jax.random.fold_in(keys[use], start) for use in ("search", "test"))
         for number in range(first, last):
             key = jax.random.fold_in(key_search, number)
@@ -291,26 +291,28 @@ def search_policies(
     def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
         """A start's policy after the blocks of generations that begin at `firsts`."""
         for first in firsts:
-            if options.until_solved and rows and _test_mean(rows[-1]) >= task.solved_reward:
+            if config.until_solved and rows and _test_mean(rows[-1]) >= task.solved_reward:
                 break
             compute = functools.partial(climb, start, first, policy)
             rows.append(store.once(f"search/start{start}-{first}", compute))
             policy = _policy_of(rows[-1])
         return policy
 
-    firsts = range(0, options.generations, options.test_every)
-    num_tried = -(-min(options.start_generations, options.generations) // options.test_every)
-    ends = [advance(i, firsts[:num_tried], search.init()) for i in range(options.num_starts)]
+    firsts = range(0, config.generations, config.test_every)
+    num_tried = -(-min(config.start_generations, config.generations) // config.test_every)
+    ends = [advance(i, firsts[:num_tried], search.init()) for i in range(config.num_starts)]
     best = int(max(rows, key=_test_mean)["start"])
     advance(best, firsts[num_tried:], ends[best])
     went_on = [row for row in rows if row["start"] == best]
     parts = np.array_split(np.arange(len(went_on)), min(num_lessons, len(went_on)))
     chosen = [max((went_on[i] for i in part), key=_test_mean) for part in parts]
-    lessons = [_lesson(options, search, task, keys["record"], row) for row in chosen]
+    lessons = [_lesson(config, search, task, keys["record"], row) for row in chosen]
     return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])
 
 
-def _lesson(options: SearchConfig, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:
+def _lesson(
+    config: PolicySearchConfig, search: Search, task: Task, key: Array, row: Arrays
+) -> Lesson:
     """A tested policy, with the states that it visits in new episodes, as the tests chose it.
 
     The cost of the new episodes is added to the row.
@@ -321,7 +323,7 @@ def _lesson(options: SearchConfig, search: Search, task: Task, key: Array, row: 
     states, total = seen.obs[seen.valid], float(seen.reward[seen.valid].sum())
     row["real_steps"] = row["real_steps"] + len(states)
     row["cpu_s"] = row["cpu_s"] + time.process_time() - started
-    return Lesson(generation, policy.layers(task.max_action), states, total / options.num_tests)
+    return Lesson(generation, policy.layers(task.max_action), states, total / config.num_tests)
 
 
 def _policy_of(tested: Arrays) -> Policy:

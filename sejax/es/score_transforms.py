@@ -18,12 +18,12 @@ from sejax.ops.scores import below_all, is_tie, or_lowest_finite, or_minus_inf
 from sejax.options import ConfigError, registry, require, told
 
 FIELD = "es.score_transform"
-Scores = Float[Array, " pop"]
-ScoreTransform = Callable[[Scores, Float[Array, ""]], Scores]
-OwnTransform = Callable[[Scores], Scores]
+PerCandidate = Float[Array, " pop"]
+ScoreTransform = Callable[[PerCandidate, Float[Array, ""]], PerCandidate]
+OwnTransform = Callable[[PerCandidate], PerCandidate]
 
 
-def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def linear(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     r"""Maps scores linearly to [0, 1]: :math:`F_i = (K_i - \min K) / (\max K - \min K)`.
 
     Args:
@@ -37,7 +37,7 @@ def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _safe_divide(scores - scores.min(), scores.max() - scores.min())
 
 
-def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def rank(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     r"""Maps ranks linearly to [0, 1]: :math:`F_i = (R_i - \min R) / (\max R - \min R)`.
 
     :math:`R_i` counts the candidates with a lower score, so that ties share a rank.
@@ -47,7 +47,7 @@ def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _safe_divide(ranks, ranks.max())  # the lowest is 0
 
 
-def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def nes(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     r"""Utilities of Wierstra et al. (2008), scaled to a largest magnitude of 1.
 
     .. math::
@@ -60,24 +60,24 @@ def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _scaled_utilities(scores, 1 / scores.shape[0])
 
 
-def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def nes_unnormalized(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """As `nes` without the subtraction of 1/n_p: the worse half weighs nothing, the best 1."""
     return _scaled_utilities(scores, 0.0)
 
 
-def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def single_best(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """1 for the candidate of the best rank (for each, if several share it), 0 for the others."""
     scores = or_minus_inf(scores)
     return jnp.where((scores == scores.max()) & jnp.isfinite(scores), 1.0, 0.0)
 
 
-def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def single_better(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """As `single_best`, but only if that candidate is better than the incumbent."""
     better = _advantage(scores, incumbent) > 0
     return jnp.where(better, single_best(scores, incumbent), 0.0)
 
 
-def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def all_better_1(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     r"""Weighs the candidates by how far they beat the incumbent. The best has weight 1.
 
     .. math:: F_i = \max(0, K_i - K_\psi) / (\max K - K_\psi)
@@ -86,7 +86,7 @@ def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return _safe_divide(advantage, advantage.max())
 
 
-def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def all_better_2(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """As `all_better_1`, with weights that sum to 1."""
     advantage = _advantage(scores, incumbent)
     return _safe_divide(advantage, advantage.sum())
@@ -124,14 +124,14 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         must = f"must give a finite weight for each of {pop} scores; {got} {scores.tolist()!s:.40}"
         require(is_fit, FIELD, f"{must}. Mend {choice}, or set {FIELD}=rank.")
 
-    def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    def transform(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
         weights = jnp.asarray(function(or_lowest_finite(scores)), jnp.float32)
         return jnp.where(jnp.isfinite(weights) & jnp.isfinite(scores).any(), weights, 0.0)
 
     return transform
 
 
-def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+def _advantage(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """Advantage over the incumbent; 0 for candidates that are worse, or better by rounding alone.
 
     Every candidate with a finite score is better than an incumbent without one.
@@ -141,7 +141,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     return jnp.where(is_better, jnp.maximum(scores - floor, 0.0), 0.0)
 
 
-def _scaled_utilities(scores: Scores, subtracted: float) -> Scores:
+def _scaled_utilities(scores: PerCandidate, subtracted: float) -> PerCandidate:
     """Log utilities less a constant, with a largest magnitude of 1; 0 if all scores are equal.
 
     Before the subtraction they sum to 1, and a score that is not finite has 0, whatever its rank.

@@ -175,8 +175,7 @@ class GridWorld(gymnasium.Env[int, int]):
         self._index: int | None = None
         self.observation_space = spaces.Discrete(task.obs_dim)
         self.action_space = spaces.Discrete(task.action_dim)
-        kwargs = {"name": name, **options}
-        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=kwargs)
+        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs={"name": name, **options})
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
         """Puts the agent on the map's S; `options` has no effect."""

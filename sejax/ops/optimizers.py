@@ -2,7 +2,7 @@
 
 XLA turns the division of an array by a number into a product in some programs, and not in others.
 So an agent would learn other weights on two devices than on one (a slow test of
-`tests/test_run.py`). Here numbers are inverted first. The plain forms are optax's.
+`tests/test_run.py`). The optimizers here invert numbers first. The plain forms are optax's.
 """
 
 from typing import TypeVar

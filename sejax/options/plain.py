@@ -232,15 +232,14 @@ def differences(
       >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
       'es.noise_std (0.1 there, 0.2 here)'
     """
-    old, new = flatten(there), flatten(here)
-    names = sorted(name for name in old.keys() | new.keys() if name.partition(".")[0] not in free)
-    names = [x for x in names if repr(old.get(x)) != repr(new.get(x)) and old.get(x) != new.get(x)]
+    stored, asked = flatten(there), flatten(here)
+    names = [x for x in sorted(stored | asked) if x.partition(".")[0] not in free]
+    pairs = {x: (stored.get(x), asked.get(x)) for x in names}
+    names = [x for x, (one, other) in pairs.items() if repr(one) != repr(other) and one != other]
     choices = {name.removesuffix(".name") for name in names if name.endswith(".name")}
     names = [x for x in names if x.endswith(".name") or x.rpartition(".")[0] not in choices]
-    texts = [
-        f"{name} ({shortened(old.get(name), 60)} there, {shortened(new.get(name), 60)} here)"
-        for name in names[:NAMED]
-    ]
+    values = {x: [shortened(value, 60) for value in pairs[x]] for x in names[:NAMED]}
+    texts = [f"{x} ({one} there, {other} here)" for x, (one, other) in values.items()]
     return ", ".join(texts) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 

@@ -85,8 +85,7 @@ class SyntheticConfig(ProxyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.horizon is not None and self.min_steps > self.horizon:
-            why = "or less, with a horizon of as many steps"
-            raise self._error("min_steps", self.horizon, why)
+            raise self._error("min_steps", self.horizon, "or less, with a horizon of as many steps")
         if self.reward_form != "network" and not self.is_bandit:
             raise self._error("reward_form", "network", "but with proxy.horizon=1")
 
@@ -106,8 +105,7 @@ class SyntheticConfig(ProxyConfig):
           ConfigError: if it does not fit.
         """
         if self.reward_form != "network" and spec.num_actions is not None:
-            why = f"for discrete actions, as of {task_name}"
-            raise self._error("reward_form", "network", why)
+            raise self._error("reward_form", "network", f"for discrete actions, as of {task_name}")
 
     @property
     def reaches_step_limit(self) -> bool:

@@ -132,8 +132,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     record, config = learned.proxies[0], learned.config
     values = {x: record[x] for x in fields_of(PretrainedProxy) if record.get(x) is not None}
     if "score" in record:
-        scores = dict.fromkeys(config["agents"], float(record["score"]))
-        values.setdefault("scores", scores)
+        values.setdefault("scores", dict.fromkeys(config["agents"], float(record["score"])))
     objective = config.get("objective")
     values |= {
         "name": name or path.stem,

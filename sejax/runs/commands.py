@@ -19,7 +19,7 @@ from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.runs import compose, runtime
 from sejax.runs.config import CommandConfig
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+BAD_INPUT, FAILED, INTERRUPTED, CLOSED = 2, 1, 130, 141  # as shells give SIGINT and SIGPIPE
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
 
 
@@ -90,7 +90,7 @@ def messages() -> Iterator[None]:
     except KeyboardInterrupt as stop:
         interrupted("Interrupted.", stop)
     except BrokenPipeError:  # the reader has closed the pipe
-        leave(0)
+        leave(CLOSED)
     except FailedError as error:
         fail(str(error), FAILED)
     except OSError as error:

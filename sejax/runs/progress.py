@@ -45,7 +45,7 @@ class RunProgress:
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values, agents = info.values, list(self._config.agents)
-        means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents[1:] and agents)
+        means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents if agents[1:])
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
             f"search mean {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"

@@ -265,8 +265,7 @@ def _share_programs(setup: str) -> list[tuple[int, Any]]:
         spread = spread_over_devices(bilevel.evaluate.evaluators[agent_index], 1, size)
 
         def evaluate(sent: Trainings) -> Any:
-            key = jax.random.wrap_key_data(sent.key)
-            return spread(dataclasses.replace(sent, key=key))
+            return spread(dataclasses.replace(sent, key=jax.random.wrap_key_data(sent.key)))
 
         return jax.jit(evaluate, compiler_options=compiler_options())
 

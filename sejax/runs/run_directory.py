@@ -147,8 +147,7 @@ class RunDirectory(Store):
         csv, is_first = self._as_csv([*self.rows, *new]), not self.rows
         tensors = jax.device_get(_bare(_named(state)))  # all at once
         tensors[_ROWS] = np.frombuffer(csv.encode(), np.uint8)
-        versions = runtime.versions()
-        self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=versions)
+        self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=runtime.versions())
         self.rows, self.cpu_s = [*self.rows, *new], cpu_s
         if is_first:
             self._remake()

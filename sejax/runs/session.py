@@ -52,15 +52,14 @@ def run(
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
-    drawn, summary_file = time.monotonic(), directory.folder / "run.json"
-    agents = sum(bilevel.evaluate.num_trainings)  # of a generation
+    drawn, agents = time.monotonic(), sum(bilevel.evaluate.num_trainings)  # of a generation
     folder, first = directory.folder.resolve(), len(directory.rows)
     run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
     with contextlib.closing(GuardedTracker(config.tracker, run, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
             if first and all(float(x["num_nonfinite"]) == agents for x in directory.rows):
                 break  # every agent of every generation has diverged
-            summary_file.unlink(missing_ok=True)  # it would tell of fewer generations
+            (directory.folder / "run.json").unlink(missing_ok=True)  # of fewer generations
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
@@ -76,31 +75,8 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    ended = "solved" if state.solved else "finished" if state.best_generation >= 0 else "diverged"
-    generations = len(directory.rows)
-    counts = {
-        "ended": ended,
-        "best_score": float(state.best_score) if state.best_generation >= 0 else None,
-        "solved_score": bilevel.solved_score,
-        "generations": generations,
-        "agents": generations * agents,
-        "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
-        "real_steps": int(directory.last("env_steps_total")),
-    }
-    with contextlib.suppress(OSError, ValueError, TypeError):  # none, or damaged
-        stored: dict[str, Any] = json.loads(summary_file.read_text(encoding="utf-8"))
-        if stored | counts == stored:
-            return stored  # which names the machine that computed it
-    versions = runtime.versions() | {package: version(package) for package in PACKAGES}
-    summary = counts | {
-        "wall_s": round(start_wall_s + time.monotonic(), 1),
-        "cpu_s": round(start_cpu_s + time.process_time() + chunks.cpu_s, 1),
-        "devices": [str(device) for device in jax.devices()],
-        "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
-        "versions": {"python": platform.python_version()} | versions,
-    }
-    write_text(summary_file, json.dumps(summary, indent=2) + "\n")
-    return summary
+    wall_s, cpu_s = start_wall_s + time.monotonic(), start_cpu_s + time.process_time()
+    return _summary(directory, bilevel, state, wall_s, cpu_s + chunks.cpu_s)
 
 
 def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:
@@ -196,6 +172,38 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
             seed=directory.settings["seed"],
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
+
+
+def _summary(
+    directory: RunDirectory, bilevel: Bilevel, state: LearnState, wall_s: float, cpu_s: float
+) -> dict[str, Any]:
+    """Writes `run.json`, unless the same is there, and returns its content."""
+    file, generations = directory.folder / "run.json", len(directory.rows)
+    agents = sum(bilevel.evaluate.num_trainings)  # of a generation
+    measured = state.best_generation >= 0
+    counts = {
+        "ended": "solved" if state.solved else "finished" if measured else "diverged",
+        "best_score": float(state.best_score) if measured else None,
+        "solved_score": bilevel.solved_score,
+        "generations": generations,
+        "agents": generations * agents,
+        "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
+        "real_steps": int(directory.last("env_steps_total")),
+    }
+    with contextlib.suppress(OSError, ValueError, TypeError):  # none, or damaged
+        stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        if stored | counts == stored:
+            return stored  # which names the machine that computed it
+    versions = runtime.versions() | {package: version(package) for package in PACKAGES}
+    summary = counts | {
+        "wall_s": round(wall_s, 1),
+        "cpu_s": round(cpu_s, 1),
+        "devices": [str(device) for device in jax.devices()],
+        "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
+        "versions": {"python": platform.python_version()} | versions,
+    }
+    write_text(file, json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
 def draw(config: LearnConfig, directory: RunDirectory, bilevel: Bilevel) -> None:

@@ -132,8 +132,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     rest = [override for name, override in by_name.items() if name not in ranges]
     own, others = compose.partition(rest, StudyConfig)
     for name, text in ranges.items():
-        must = "must be one value in a search"
-        require(name not in ONE_VALUE, name, must, got=text, use="VALUE")
+        require(name not in ONE_VALUE, name, "must be one value in a search", got=text, use="VALUE")
     for name, text in (ranges | others).items():
         must = "must be left out, as the search sets it"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."

@@ -53,8 +53,7 @@ def open_study(search: StudyPlan) -> optuna.Study:
     store = Store(folder, search.settings(), field="search_dir", free=FREE)
     budgets = search.config.min_generations, search.config.max_generations
     # An address would end at a question mark in the folder's name.
-    file = folder / "study.db"
-    connect = functools.partial(sqlite3.connect, file, WAIT, check_same_thread=False)
+    connect = functools.partial(sqlite3.connect, folder / "study.db", WAIT, check_same_thread=False)
     with _lock(search, "study"):
         is_new = store.get("search") is None
         study = optuna.create_study(

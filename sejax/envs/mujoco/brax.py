@@ -56,8 +56,7 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
         """One control step of 0.05 s; the key has no effect."""
         nothing = jnp.float32(0)
         metrics = dict.fromkeys(self._info_keys, nothing)
-        before = State(state.physics, None, nothing, nothing, metrics)
-        after = self._brax.step(before, action)
+        after = self._brax.step(State(state.physics, None, nothing, nothing, metrics), action)
         info = {**after.metrics, "discount": jnp.float32(1)}
         state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
         return after.obs, state, after.reward, jnp.bool_(False), info
