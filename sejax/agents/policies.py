@@ -21,8 +21,7 @@ def decayed_epsilon(
 
     Source: `docs/reference.md` 3.4.
     """
-    epsilon = jnp.maximum(init * decay**episode, minimum)
-    return jnp.where(episode == 0, init, epsilon)
+    return jnp.where(episode == 0, init, jnp.maximum(init * decay**episode, minimum))
 
 
 def epsilon_greedy(

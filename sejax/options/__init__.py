@@ -294,6 +294,8 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         must = f"be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     use = "VALUE" if is_open else as_text(default)
+    if must == "be a valid tuple":
+        must, use = "be a list in brackets", f"[{shortened(got, 20)}]"
     raise ConfigError.of(name, f"must {must}", got=repr(got), use=use)
 
 

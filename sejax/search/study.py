@@ -23,7 +23,7 @@ from optuna.trial import Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from sejax.ops.files import require_writable, write_text
-from sejax.options import ConfigError, place_of, told
+from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.options.plain import parsed
 from sejax.runs import session
 from sejax.runs.chunks import make_chunks
@@ -258,8 +258,7 @@ def report(study: optuna.Study, search: StudyPlan) -> None:
     write_text(search.folder / "trials.csv", rows.to_csv(index=False))
     best = rows[rows["state"] == "COMPLETE"]
     if best.empty:
-        print("No trial was completed.")
-        return
+        raise FailedError(f"No trial was completed. {search.folder}/trials.csv says why.")
     best = best[SHOWN].sort_values(["value", "train_steps"], ascending=[False, True], kind="stable")
     table = best.head(10).to_string(index=False)
     print(f"\nThe best of {len(rows)} trials, of which {len(best)} are complete:\n{table}")
