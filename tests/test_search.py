@@ -15,7 +15,7 @@ from support import metrics, printed, refused
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
 from sejax.ops.files import write_text  # noqa: E402
-from sejax.options import ConfigError  # noqa: E402
+from sejax.options import ConfigError, FailedError  # noqa: E402
 from sejax.run import learn_all  # noqa: E402
 from sejax.runs import config as configuration  # noqa: E402
 from sejax.search import __main__ as command  # noqa: E402
@@ -117,7 +117,8 @@ def test_trials_that_are_refused_or_not_finite_are_pruned(tmp_path, learning, ca
     learning.refusal, learning.score = reason, lambda *_: math.nan
     current, search = opened(tmp_path, *ONE, "trials=2")
     study.work(current, search)
-    study.report(current, search)
+    with pytest.raises(FailedError, match="No trial"):
+        study.report(current, search)
     assert states(current) == ["PRUNED"] * 2
     assert reason in capsys.readouterr().out
 
