@@ -26,7 +26,7 @@ from sejax.es.nes import NESConfig
 from sejax.generation import Candidates, GenerationEvaluator
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
-from sejax.ops.scores import or_minus_inf
+from sejax.ops.scores import or_minus_inf, reaches
 from sejax.options import Count, checked, require
 from sejax.options.registry import Makes, make, require_part
 from sejax.proxies.base import ProxyEnv
@@ -82,7 +82,7 @@ class Bilevel:
 
     def ends_run(self, score: Array) -> Array | bool:
         """Whether this incumbent mean ends the run."""
-        return self.stop_when_solved and score >= self.proxy.task.solved_reward
+        return self.stop_when_solved and reaches(score, self.proxy.task.solved_reward)
 
     def init(self, key: Array) -> LearnState:
         """The state before the first generation, with random weights of the proxy."""

@@ -38,6 +38,7 @@ from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import ENOUGH, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
+from sejax.ops.scores import reaches
 from sejax.options import LARGEST, Count, as_text, errors_of, registry, require
 from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
@@ -230,7 +231,7 @@ def _null(
     search = PolicySearchConfig(**fields, generations=generations, until_solved=True)
     (lesson,), costs = search_policies(search, task, 1, keys, store, config.devices)
     method, steps = "a random search", costs["real_steps"].sum()
-    if lesson.policy_return < task.solved_reward:
+    if not reaches(lesson.policy_return, task.solved_reward):
         how = CopyConfig(agent_steps=config.null_steps)
         (other,), costs = copy_policy(how, task, "ppo", keys, store)
         steps += costs["real_steps"].sum()
@@ -265,7 +266,7 @@ def _reported(
     table["test_return"] = counted(table["test_return"].mask(is_lost))
     table["train_steps"] = table["train_steps"].mask(is_lost, table["train_steps"].max())
     table["score"] = -table["train_steps"] if is_rn else table["test_return"]
-    table["solved"] = table["test_return"] >= task.solved_reward
+    table["solved"] = reaches(table["test_return"], task.solved_reward)
     by_agent = table.groupby(["world", "agent"], sort=False)
     scores = {name: score.to_numpy() for name, score in by_agent["score"]}
     judgements, goal = {}, float(task.solved_reward)

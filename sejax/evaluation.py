@@ -99,8 +99,7 @@ def _greedy(
             obs=obs,
             env_state=env_state,
         )
-        steps = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
-        return after, steps
+        return after, Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
 
     return begin, step
 

@@ -25,6 +25,7 @@ from sejax.ops.keys import step_keys
 from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
 from sejax.ops.modes import require_modes
 from sejax.ops.parallel import in_batches_on_cpu
+from sejax.ops.scores import reaches
 from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require, shortened
 from sejax.options.registry import require_part
 from sejax.proxies.base import is_real, proxy_in
@@ -502,7 +503,7 @@ def is_solved(
 ) -> Array:
     """Whether the mean of the last d returns (of all, if fewer) reaches the solved reward."""
     window = recent.shape[0] // 2
-    return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
+    return reaches(recent[window:].sum() / jnp.clip(num_episodes, 1, window), solved_reward)
 
 
 def _all_finite(tree: PyTree) -> Array:

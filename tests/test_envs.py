@@ -165,8 +165,7 @@ def draw_steps(name, num=1000):
     """States from all over the box, `[num, fields]`, and actions."""
     rng = np.random.default_rng(0)
     low, high = np.transpose([*STATES[name].values()])
-    states = rng.uniform(low, high, (num, len(low)))
-    return states, draw_actions(envs.make(name), rng, num)
+    return rng.uniform(low, high, (num, len(low))), draw_actions(envs.make(name), rng, num)
 
 
 @pytest.mark.parametrize("name", CLASSIC)
@@ -183,14 +182,15 @@ def test_a_thousand_steps_equal_gymnasiums(name):
         assert 0.02 < expected_terminated.mean() < 0.98
     # In float64 the equations are Gymnasium's, up to its float32 observation.
     with jax.enable_x64(True):
-        step = step_from(name, task.env, task.params)
-        obs, _, reward, terminated, _ = step(states, actions)
+        obs, _, reward, terminated, _ = step_from(name, task.env, task.params)(states, actions)
     np.testing.assert_allclose(obs, expected_obs, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(terminated, expected_terminated)
     np.testing.assert_allclose(reward, expected_reward, atol=1e-6)
     # In float32, as we run them, Acrobot's fastest spins amplify rounding in a step of a thousand.
     step = step_from(name, task.env, task.params)
-    obs, _, _, terminated, _ = step(np.float32(states), actions)
+    obs, after, _, terminated, _ = step(np.float32(states), actions)
+    over = jax.vmap(task.env.is_terminated, (0, None))(after, task.params)
+    np.testing.assert_array_equal(over, terminated)
     error = np.abs(obs - expected_obs) / (1 + np.abs(expected_obs))
     assert np.quantile(error.max(axis=1), 0.998) < 1e-4
     assert error.max() < 1e-2

@@ -99,3 +99,4 @@ def test_a_number_that_never_varies_is_kept():
 ])  # fmt: skip
 def test_what_does_not_fit_is_refused(task, layers, field):
     assert refused(make_exact, sejax.envs.make(task), layers, STATES) == field
+    assert refused(make_exact, sejax.envs.make("pendulum"), layers, STATES[:1]) == "states"

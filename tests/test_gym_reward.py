@@ -203,8 +203,7 @@ def test_a_walk_in_a_grid_world_is_that_in_jax(name):
 def test_the_time_limit_is_the_tasks_and_there_once():
     env = gymnasium.make("sejax/mountain_car_continuous-rn")
     env.reset(seed=0)
-    ends = [env.step([0.0])[2:4] for _ in range(999)]
-    assert ends == [(False, False)] * 998 + [(False, True)]
+    assert [env.step([0.0])[2:4] for _ in range(999)] == [(False, False)] * 998 + [(False, True)]
     assert str(env).count("TimeLimit") == 1
     env = make("cliff_walking-rn")
     env.reset()
@@ -233,6 +232,7 @@ def test_what_does_not_fit_is_one_message():
     assert refused(RewardNetwork, gymnasium.make("MountainCar-v0"), "cartpole-rn") == "env"
     # In Gymnasium's cliff walking no fall ends an episode.
     assert refused(RewardNetwork, gymnasium.make("CliffWalking-v1"), "cliff_walking-rn") == "env"
+    assert signature(spaces.Discrete(4)) != signature(spaces.Discrete(4, start=1))
     assert refused(make, "cartpole-rn", RealTask.of_env(cartpole)) == "task"
     for discount in (float("nan"), 3, "x"):
         assert refused(RewardNetwork, cartpole, "cartpole-rn", discount) == "discount"
@@ -242,7 +242,8 @@ def test_what_does_not_fit_is_one_message():
 def test_the_network_sees_the_tasks_own_observations():
     cartpole = gymnasium.make("CartPole-v1")
     normalized = wrappers.TransformReward(wrappers.NormalizeObservation(cartpole), float)
-    assert refused(RewardNetwork, normalized, "cartpole-rn") == "env"
+    for env in (normalized, wrappers.NormalizeReward(cartpole), wrappers.ClipReward(cartpole, 0)):
+        assert refused(RewardNetwork, env, "cartpole-rn") == "env"
     assert wrappers.NormalizeObservation(RewardNetwork(cartpole, "cartpole-rn")).reset(seed=0)
     pendulum = gymnasium.make("InvertedPendulum-v5")  # 4 numbers too, and other actions
     assert refused(RewardNetwork, pendulum, "cartpole-rn") == "env"
@@ -262,11 +263,9 @@ def test_the_info_of_an_unknown_task_is_not_known(stored_rn):
 
 def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
     for task in ({"name": "gymnax/Pendulum-v1"}, {"name": "halfcheetah", "backend": "spring"}):
-        env = envs.make("pendulum")
-        rn = registry.make("proxy", RewardConfig(hidden_size=2), env)
+        rn = registry.make("proxy", RewardConfig(hidden_size=2), envs.make("pendulum"))
         path = tmp_path / "rn.safetensors"
-        weights = random_like(shapes_of(rn.init_weights, KEY))
-        sejax.save(path, rn, weights, discount=0.9)
+        sejax.save(path, rn, random_like(shapes_of(rn.init_weights, KEY)), discount=0.9)
         forge(path, env=task)
         assert refused(make, path) == "task"
         assert make(path, "Pendulum-v1").reset(seed=0)[0].shape == (3,)

@@ -16,7 +16,7 @@ from sejax import options
 from sejax.agents import traced
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import ranges_of
-from sejax.options import Options, option
+from sejax.options import Options, Positive, option
 
 NAN, INF = float("nan"), float("inf")
 
@@ -74,10 +74,10 @@ def test_a_value_at_the_edge_of_its_rule_is_taken(field, values):
 # --- what is traced, and what is varied ----------------------------------------------------------
 
 
-def test_a_subclass_that_changes_a_default_keeps_bounds_marks_and_help_text():
+def test_a_subclass_that_changes_a_default_keeps_marks_and_help_text():
     @dataclasses.dataclass(frozen=True, kw_only=True)
     class Mine(QLearningConfig):
-        learning_rate: float = 0.5
+        learning_rate: Positive = 0.5
 
     assert traced(Mine()).learning_rate == 0.5
     assert "agent.learning_rate=0.5." in str(refusal(Mine, learning_rate=0))

@@ -22,7 +22,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.envs.wrappers import PartlyScored, PartParams
 from sejax.evaluation import make_recorder, make_tester
 from sejax.options import registry
-from sejax.training import is_plateau, make_trainer
+from sejax.training import is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)
@@ -135,6 +135,11 @@ def test_a_solved_training_that_is_tested_throughout_goes_on():
     for rule, goes_on in (("tested", "never"), ("plateau", "plateau")):
         throughout = evaluation.tested_throughout(VARIANTS[rule])
         assert throughout == training(stop_rule=goes_on, tests_between=1)
+
+
+def test_a_mean_that_equals_the_solved_reward_but_for_rounding_solves():
+    returns = np.float32([0] * 10 + [np.float32(-0.01) + 1] * 10)
+    assert is_solved(returns, 100, 0.99) and not is_solved(returns, 100, np.inf)
 
 
 def test_a_step_budget_ends_training_within_an_episode():

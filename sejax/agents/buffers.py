@@ -66,8 +66,7 @@ class Rollout(NamedTuple):
         """The steps, feature-major. Discrete actions in one column are indices."""
         steps = self.rows[:, :-1].T  # without `ended`
         action_dim = steps.shape[0] - 2 * obs_dim - 2
-        is_index = is_discrete and action_dim == 1
-        return unpack(steps, None if is_index else action_dim)
+        return unpack(steps, None if is_discrete and action_dim == 1 else action_dim)
 
     def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
         """The same steps with a bonus added to each reward."""

@@ -47,8 +47,7 @@ class DDQNConfig(OffPolicyOptions):
     double: bool = True
 
     def spec(self) -> AgentSpec:
-        product = self.hidden_size * self.batch_size
-        is_small = self.num_layers == 1 and product <= cpu.SMALL_PRODUCT
+        is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
         width = cpu.SMALL_NUM_PARALLEL if is_small else 1
         return dataclasses.replace(super().spec(), cpu_num_parallel=width)
 

@@ -289,8 +289,7 @@ class DiscreteSAC(SAC):
     ) -> tuple[Array, Array]:
         log_p = jax.nn.log_softmax(outputs, axis=0)
         p = jnp.exp(log_p)
-        q_value = jnp.sum(p * lesser(critics(obs)), axis=0)
-        return q_value, -jnp.sum(p * log_p, axis=0)
+        return jnp.sum(p * lesser(critics(obs)), axis=0), -jnp.sum(p * log_p, axis=0)
 
     def env_action(self, action: Array) -> Array:
         return action

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from sejax.envs.base import Task
 from sejax.evaluation import Steps, Tests, make_fixed, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
-from sejax.ops.scores import merged_moments, or_lowest_finite
+from sejax.ops.scores import merged_moments, or_lowest_finite, reaches
 from sejax.options import Count, Finite, NonNegative, Options, Positive, require
 from sejax.proxies.exact import Layer, require_vectors
 from sejax.runs.store import Store
@@ -223,8 +223,7 @@ def step_size(config: PolicySearchConfig, number: Array | int) -> Array:
 def with_moments(policy: Policy, obs: Float[Array, "step obs_dim"], valid: Array) -> Policy:
     """The policy with observations added to its moments; its weights stay."""
     count = valid.sum()
-    rows = jnp.where(valid[:, None], obs, 0.0)
-    mean = rows.sum(0) / jnp.maximum(count, 1)
+    mean = jnp.where(valid[:, None], obs, 0.0).sum(0) / jnp.maximum(count, 1)
     square = jnp.where(valid[:, None], (obs - mean) ** 2, 0.0).sum(0)
     return Policy(policy.weights, *merged_moments(policy[1:], (count, mean, square)))
 
@@ -291,7 +290,7 @@ def search_policies(
     def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
         """A start's policy after the blocks of generations that begin at `firsts`."""
         for first in firsts:
-            if config.until_solved and rows and _test_mean(rows[-1]) >= task.solved_reward:
+            if config.until_solved and rows and reaches(_test_mean(rows[-1]), task.solved_reward):
                 break
             compute = functools.partial(climb, start, first, policy)
             rows.append(store.once(f"search/start{start}-{first}", compute))

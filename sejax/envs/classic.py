@@ -79,8 +79,7 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
         velocity = jnp.clip(state.velocity + acceleration, -params.max_speed, params.max_speed)
         position = state.position + velocity
         position = jnp.clip(position, params.min_position, params.max_position)
-        is_at_wall = (position <= params.min_position) & (velocity < 0)
-        velocity = jnp.where(is_at_wall, 0.0, velocity)
+        velocity = jnp.where((position <= params.min_position) & (velocity < 0), 0.0, velocity)
         state = CarState(position=position, velocity=velocity, time=state.time + 1)
         reward = jnp.where(self.is_terminated(state, params), 100.0, 0.0) - 0.1 * action**2
         return self.after(state, reward, params)

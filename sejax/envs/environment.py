@@ -1,9 +1,9 @@
 """A gymnax 1.x `Environment` that does not import gymnax.
 
 Importing anything of gymnax imports all its environments, and with them seaborn and pandas. That
-takes a CPU second. The methods are gymnax's, and so are the spaces that they return. So code for
-environments of gymnax takes ours too; only `isinstance` tells them apart. gymnax is imported when
-its spaces are asked for.
+takes a CPU second. `reset`, `step`, `reset_env`, `step_env`, `is_truncated`, `action_space` and
+`observation_space` are gymnax's, and so are the spaces. So gymnax's wrappers take ours too; only
+`isinstance` tells them apart. gymnax is imported when its spaces are asked for.
 """
 
 import dataclasses

@@ -37,6 +37,9 @@ class Wrapper(Environment[State, Params]):
     ) -> Array:
         return self.env.get_obs(state, params, key)
 
+    def is_terminated(self, state: State, params: Params) -> Array:
+        return self.env.is_terminated(state, params)
+
     def is_truncated(self, state: State, params: Params) -> Array:
         return self.env.is_truncated(state, params)
 

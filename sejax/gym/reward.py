@@ -9,7 +9,7 @@ from gymnasium import ObservationWrapper
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.spaces import Discrete, flatdim, flatten
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import DtypeObservation, FlattenObservation
+from gymnasium.wrappers import DtypeObservation, FlattenObservation, NormalizeReward
 from numpy.typing import ArrayLike
 
 from sejax import envs
@@ -141,11 +141,12 @@ def _require_task(env: Env, header: Header) -> None:
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
     seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    must = f"must be sejax's {shortened(header.task, 40)}, its observations unchanged by wrappers"
+    must = f"must be sejax's {shortened(header.task, 40)}, its numbers unchanged by wrappers"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, which has other rules
         and signature(env.observation_space) == signature(learned.observation_space)
         and signature(env.unwrapped.action_space) == signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
+        and not any(isinstance(x, gymnasium.RewardWrapper | NormalizeReward) for x in layers)
     )
     require(is_same, "env", must, got=env)

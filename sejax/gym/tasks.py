@@ -207,7 +207,8 @@ class GridWorld(gymnasium.Env[int, int]):
 
 def signature(space: spaces.Space[Any]) -> tuple[object, ...]:
     """What must be equal for two spaces to be of one task."""
-    return type(space), space.shape, space.is_np_flattenable and spaces.flatdim(space)
+    size = space.is_np_flattenable and spaces.flatdim(space)
+    return type(space), space.shape, size, getattr(space, "start", 0)
 
 
 def _gymnasium_space(space: Space) -> spaces.Space[Any]:

@@ -1,6 +1,6 @@
 """Statistics of scores that may not be finite, or equal but for rounding; moments of numbers."""
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -18,6 +18,11 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
     each other, such differences would give large weights. The authors' code has 1e-6 as well.
     """
     return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
+
+
+def reaches(score: Any, goal: Any) -> Any:
+    """Whether mean scores reach a goal, but for rounding; none reaches infinity."""
+    return score >= goal - _TIE * (1 + abs(goal))
 
 
 def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:

@@ -65,6 +65,9 @@ def make_exact(
     states = np.asarray(states, float)
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
     require_vectors(task)
+    is_fit = states.shape == (len(states), task.obs_dim) and np.isfinite(states).all()
+    must = f"must be two or more rows of {task.obs_dim} finite numbers"
+    require(is_fit and len(states) > 1, "states", must, got=states.shape)
     shapes = [kernel.shape for kernel, _ in layers]
     sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
     is_chain = layers and shapes == [*zip(sizes[1:], sizes[:-1], strict=True)]

@@ -106,8 +106,7 @@ def _sizes_of(space: Space) -> list[int]:
     """The counts in a space; 0 if a lower bound exceeds the upper one."""
     if not isinstance(space, Box):
         return [space.n]
-    are_bounds = all(low <= high for low, high in zip(space.low, space.high, strict=True))
-    return [space.size * are_bounds]
+    return [space.size * all(low <= high for low, high in zip(space.low, space.high, strict=True))]
 
 
 def is_registered(group: str, stored: object) -> bool:

@@ -144,11 +144,11 @@ class RewardEnv(ProxyEnv):
 
     where gamma is the agent's discount. A discrete state is one-hot to the network. With
     `zero_at_terminal` :math:`\Phi` is 0 where the episode ends for the agent: where it terminates,
-    and at the step limit if agents do not bootstrap there. Only then does `additive_potential`
-    leave the optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's
-    value. An agent that repeats its actions gets the sum of the rewards of all steps. As in the
-    authors' code, each step is shaped with the discount of a whole decision, so that for this agent
-    the potentials of the steps between do not cancel.
+    and at the step limit with `training.time_limit_is_terminal`. Only then does
+    `additive_potential` leave the optimal policy as it is (Ng et al., 1999); the authors' code
+    keeps the network's value. An agent that repeats its actions gets the sum of the rewards of all
+    steps. As in the authors' code, each step is shaped with the discount of a whole decision, so
+    that for this agent the potentials of the steps between do not cancel.
 
     :math:`\Phi` is the network's output times `output_scale`, 1 in the paper.
 

@@ -6,6 +6,7 @@ import time
 import numpy as np
 
 from sejax.bilevel import Bilevel
+from sejax.ops.scores import reaches
 from sejax.options import registry
 from sejax.options.plain import to_plain
 from sejax.runs import compose
@@ -59,7 +60,7 @@ class RunProgress:
     def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how the run ended, where its files are, and what to do next."""
         path, solved_score = directory.folder, bilevel.solved_score
-        is_solved = solved_score is not None and np.float32(best) >= np.float32(solved_score)
+        is_solved = solved_score is not None and reaches(best, solved_score)
         verdict = f"best search mean {best:.1f}"
         if solved_score is not None:
             verdict = f"{'' if is_solved else 'not '}solved: {verdict}, solved at {solved_score:g}"
