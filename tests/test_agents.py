@@ -92,8 +92,7 @@ def parts(case):
 
         arrays, _ = jax.lax.scan(store, buffer.init(), jnp.arange(NUM_STEPS))
         last = transition(jax.random.fold_in(key, NUM_STEPS - 1))
-        batch = buffer.batch(key, arrays, jnp.int32(NUM_STEPS), last, agent.batch_size(state))
-        return state, batch
+        return state, buffer.batch(key, arrays, jnp.int32(NUM_STEPS), last, agent.batch_size(state))
 
     return task, agent, jax.jit(start)
 
@@ -215,8 +214,7 @@ def test_units_and_columns_out_of_use_take_no_part(case):
     assert agent.batch_size(state) == 5 and batch.weight.sum() == 5
     # Parameters that init narrowed to 0, in whichever of the state's vectors.
     leaves = [x for x in jax.tree.leaves(state) if x.ndim]
-    update = jax.jit(agent.update)
-    after = update(jax.random.key(3), state, batch)
+    after = jax.jit(agent.update)(jax.random.key(3), state, batch)
     for before, then in zip(leaves, [x for x in jax.tree.leaves(after) if x.ndim], strict=True):
         kept = (before == 0) & np.any(before != 0)  # not Adam's moments, which begin at 0
         np.testing.assert_array_equal(np.asarray(then)[kept], 0.0)

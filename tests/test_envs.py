@@ -230,8 +230,7 @@ def step_everywhere(env, params):
         return out[0], out[2], out[3]
 
     over_actions = jax.vmap(step, (None, 0))
-    indices = jnp.arange(env.spaces[0].n)
-    table = jax.jit(jax.vmap(over_actions, (0, None)))(indices, jnp.arange(4))
+    table = jax.jit(jax.vmap(over_actions, (0, None)))(jnp.arange(env.spaces[0].n), jnp.arange(4))
     return [np.asarray(x) for x in table]
 
 

@@ -4,12 +4,13 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from gymnasium import wrappers
+from gymnasium import spaces, wrappers
 from support import forge, numpy_forward, random_like, refused, shapes_of
 
 import sejax
 from sejax import envs
 from sejax.gym import GridWorld, RealTask, RewardNetwork, make, make_vec, networks
+from sejax.gym.tasks import signature
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.proxies import header

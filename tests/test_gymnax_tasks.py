@@ -153,8 +153,7 @@ def changed(**attributes):
 
 def echo(self, key, state, action, params):
     """The observation is what the action came to."""
-    obs = jnp.resize(jnp.float32(action), self.obs.shape)
-    return obs, state, 0.0, jnp.bool_(False), {}
+    return jnp.resize(jnp.float32(action), self.obs.shape), state, 0.0, jnp.bool_(False), {}
 
 
 def odd_task(actions, observations=Plain.observations):
