@@ -1,6 +1,6 @@
 """Tasks of other JAX suites, through stoa; and fresh agents with and without a reward network.
 
-    pip install 'sejax[stoa]' navix
+    pip install '.[stoa]' navix
     python -m sejax.run env=other_suites:task env.suite=navix env.env_id=Navix-Empty-5x5-v0 \
         env.solved_reward=0.9 proxy=rn agent=ppo               # in this folder
     python other_suites.py env.suite=navix env.env_id=Navix-Empty-5x5-v0 env.solved_reward=0.9

@@ -1,7 +1,7 @@
 """Is a learned environment more than a policy? Four comparisons and a verdict.
 
   python -m sejax.check proxy=RUN_DIR
-  python -m sejax.check proxy=cartpole num_agents=40 algorithms=[sac]
+  python -m sejax.check proxy=cartpole num_agents=40 'algorithms=[sac]'
 
 - Myopia: the agents that it was learned with, at lower discounts. Left out if episodes have one
   step, where a discount has no effect.

@@ -3,7 +3,7 @@
 By default they are the agents that the proxy was learned with; agent=NAME takes another one.
 
   python -m sejax.evaluate proxy=RUN_DIR num_agents=20
-  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
+  python -m sejax.evaluate proxy=cartpole 'agents=[ddqn,ppo]' agents.ppo.epochs=10
 
 Writes evaluation.csv and .json into out_dir. --print-config prints the configuration alone.
 """

@@ -240,6 +240,7 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
+    require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_part("training", TrainingConfig, training)
     sizes, must = sizes_of(task.observation, task.action), "must be made for a task of such spaces"

@@ -2,7 +2,7 @@
 the task's real dynamics). Its score comes from agents that train on nothing else.
 
   python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
-  python -m sejax.run agents=[ddqn,ppo] mixture.weights.ddqn=2 mixture.aggregate=min
+  python -m sejax.run 'agents=[ddqn,ppo]' mixture.weights.ddqn=2 mixture.aggregate=min
   python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
   python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
 

@@ -83,8 +83,7 @@ def scripted_agent(warmup_episodes=2, batch_size=64):
 
     def update(key, state, batch):
         discount = jnp.minimum(state.min_discount, batch.discount.min())
-        num_updates = state.num_updates + 1
-        return state.replace(num_updates=num_updates, batch=batch, min_discount=discount)
+        return state.replace(num_updates=state.num_updates + 1, batch=batch, min_discount=discount)
 
     return Agent(
         init=init,

@@ -329,7 +329,7 @@ def test_help_shows_each_field_with_its_value_and_text(module, words, schema, ex
 @pytest.mark.parametrize("override", ["tracker=tensorboard", "machines=ray"])
 def test_a_package_that_is_missing_is_named_before_anything_starts(override, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert f"pip install 'sejax[{override.partition('=')[2]}]'" in str(refused(override))
+    assert f"pip install '.[{override.partition('=')[2]}]'" in str(refused(override))
 
 
 def test_importing_sejax_imports_nothing_slow_and_touches_nothing():

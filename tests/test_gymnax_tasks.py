@@ -137,7 +137,8 @@ class Plain:
         return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
 
     def step_env(self, key, state, action, params):
-        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
+        after = state.replace(time=state.time + 1)
+        return jnp.array(self.obs), after, self.reward, jnp.array(self.terminated), {}
 
     def action_space(self, params):
         return self.actions
@@ -153,7 +154,8 @@ def changed(**attributes):
 
 def echo(self, key, state, action, params):
     """The observation is what the action came to."""
-    return jnp.resize(jnp.float32(action), self.obs.shape), state, 0.0, jnp.bool_(False), {}
+    after = state.replace(time=state.time + 1)
+    return jnp.resize(jnp.float32(action), self.obs.shape), after, 0.0, jnp.bool_(False), {}
 
 
 def odd_task(actions, observations=Plain.observations):
@@ -225,6 +227,7 @@ class Limit(NamedTuple):
     (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "env"),
     (changed(obs=np.zeros(3)), {}, "env"),
     (changed(step_env=drifts), {}, "env"),
+    (changed(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, jnp.bool_(False), {})), {}, "env"),
     (changed(terminated=np.float32(0)), {}, "env"),
     (changed(reward=np.zeros(2)), {}, "env"),
     (gymnax.make("CartPole-v1"), {}, "env"),  # a pair

@@ -169,8 +169,7 @@ def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path
     learn(folder, "generations=6", word)  # nothing is left to do: not even opened
     assert_same(folder, uninterrupted)
     lines = [json.loads(line) for line in (tmp_path / "lines").read_text().splitlines()]
-    heads = [line[0] for line in lines]
-    assert heads == ["open", 0, 1, 2, "close", "open", 3, 4, "close"]
+    assert [line[0] for line in lines] == ["open", 0, 1, 2, "close", "open", 3, 4, "close"]
     assert lines[0][1] == lines[5][1] and (lines[0][2], lines[5][2]) == (0, 3)
     heard = [line for line in lines if isinstance(line[0], int)]
     for (_, mean, scores, steps), row in zip(heard, rows(folder), strict=False):

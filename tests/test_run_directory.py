@@ -223,8 +223,7 @@ def test_a_state_of_another_structure_is_refused(run, like):
 
 
 def test_another_configuration_is_refused_with_what_differs(run):
-    es = dataclasses.replace(CONFIG.es, noise_std=0.1)
-    said = refused(run, es=es, seed=3)
+    said = refused(run, es=dataclasses.replace(CONFIG.es, noise_std=0.1), seed=3)
     assert "es.noise_std (0.0124 there, 0.1 here), seed (7 there, 3 here)" in said
     (run / "config.yaml").unlink()
     assert "seed (7 there, 3 here)" in refused(run, seed=3)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from support import metrics, printed, refused
 
-optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
+optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install '.[search]'")
 
 from sejax.ops.files import write_text  # noqa: E402
 from sejax.options import ConfigError, FailedError  # noqa: E402
@@ -183,8 +183,7 @@ def test_a_trial_that_ends_meanwhile_is_left_alone(tmp_path, learning, monkeypat
     current, search = opened(tmp_path, "trials=2", *ONE)
     theirs, get_trials = current.ask(), current.get_trials
     ends = [lambda: current.tell(theirs, 1.0)]
-    before = lambda **_: (get_trials(), ends and ends.pop()())[0]  # noqa: E731
-    monkeypatch.setattr(current, "get_trials", before)
+    monkeypatch.setattr(current, "get_trials", lambda **_: (get_trials(), ends and ends.pop()())[0])
     study.work(current, search)
     assert states(current) == ["COMPLETE"] * 2 and current.trials[0].value == 1.0
 

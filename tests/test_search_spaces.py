@@ -2,7 +2,7 @@
 
 import pytest
 
-pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
+pytest.importorskip("optuna", reason="needs Optuna: pip install '.[search]'")
 
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from support import refusal, refused
@@ -132,4 +132,4 @@ def test_help_says_what_each_field_is():
 
 def test_without_optuna_the_extra_is_named(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "pip install 'sejax[search]'" in str(refusal(command.main, []))
+    assert "pip install '.[search]'" in str(refusal(command.main, []))

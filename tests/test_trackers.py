@@ -95,7 +95,7 @@ def events(folder):
 
 
 def test_tensorboard_reads_scalars_and_histograms(tmp_path):
-    pytest.importorskip("tensorboardX", reason="pip install 'sejax[tensorboard]'")
+    pytest.importorskip("tensorboardX", reason="pip install '.[tensorboard]'")
     track(tmp_path, trackers.TensorBoardConfig())
     values = [(event.step, value) for event in events(tmp_path / "tensorboard")
               for value in event.summary.value]  # fmt: skip

@@ -39,9 +39,8 @@ class TorchSAC:
         ]  # fmt: skip
 
     def alpha(self):
-        if self.config.alpha is not None:
-            return self.config.alpha
-        return self.log_alpha.exp().detach()
+        fixed = self.config.alpha
+        return fixed if fixed is not None else self.log_alpha.exp().detach()
 
     def soft_values(self, critics, obs, noise):
         """The lesser critic's value and the entropy."""

@@ -261,8 +261,7 @@ def sample_indices(
     of MurmurHash3 on a Weyl sequence. 24 of its bits choose the index, so that the bias is below
     size / 2**24.
     """
-    counter = jnp.arange(batch_size, dtype=jnp.uint32)
-    x = murmur(seed + counter * jnp.uint32(WEYL))
+    x = murmur(seed + jnp.arange(batch_size, dtype=jnp.uint32) * jnp.uint32(WEYL))
     fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
     index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
     return jnp.minimum(index, size - 1)  # rounding may reach size

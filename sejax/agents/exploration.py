@@ -274,8 +274,7 @@ def icm_loss(
 
 def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
     """Mean over the features of the forward model's squared error, for each column."""
-    error = outputs.predicted_next_features - outputs.next_features
-    return jnp.mean(error**2, axis=0)
+    return jnp.mean((outputs.predicted_next_features - outputs.next_features) ** 2, axis=0)
 
 
 def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:

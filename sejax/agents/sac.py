@@ -153,9 +153,7 @@ class SAC(ActorCritic):
 
     def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
         outputs = self.outputs(state.params, obs)
-        if not explore:
-            return self.best(outputs)
-        return self.sample(key, outputs, state.is_warming_up)
+        return self.sample(key, outputs, state.is_warming_up) if explore else self.best(outputs)
 
     def update(self, key: Array, state: SACState, batch: Transition) -> SACState:
         return self.learn(state, batch, self.draw(key, batch.reward.size))

@@ -284,8 +284,7 @@ class DiscreteTD3(TD3):
         return action
 
     def warm_up(self, key: Array) -> Array:
-        index = jax.random.randint(key, (), 0, self.action_dim)
-        return jax.nn.one_hot(index, self.action_dim)
+        return jax.nn.one_hot(jax.random.randint(key, (), 0, self.action_dim), self.action_dim)
 
     def best(self, outputs: Array) -> Array:
         return _one_hot_of_largest(outputs)

@@ -61,8 +61,7 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
 def _range(how: str, value: float, integer: bool) -> Range:
     match how:
         case "triple":
-            low = max(1, value // 3) if integer else value / 3
-            return Range(low, 3 * value, True, integer)
+            return Range(max(1, value // 3) if integer else value / 3, 3 * value, True, integer)
         case "one_more_or_less":
             return Range(max(1, value - 1), value + 1, False, True)
         case "tenth_to_one":

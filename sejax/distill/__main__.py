@@ -3,7 +3,7 @@
   python -m sejax.distill env=pendulum policy=ppo:model.zip    a model of Stable-Baselines3
   python -m sejax.distill env=cartpole policy=my_module:act    a function of observations
   python -m sejax.distill env=cartpole policy=ppo              an agent of sejax, which is trained
-  python -m sejax.distill env=halfcheetah agents=[td3,sac,ppo] search.generations=200
+  python -m sejax.distill env=halfcheetah 'agents=[td3,sac,ppo]' search.generations=200
 
 A small network copies the policy and becomes the reward of a one-step SE. Without `policy`,
 augmented random search finds linear policies. The best policy of each part of the search becomes

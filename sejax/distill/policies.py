@@ -115,7 +115,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
 
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # of any kind: the file, the algorithm or the library
-        got = f"{shortened(text)} ({options.told(error)}). It needs pip install 'sejax[sb3]'"
+        got = f"{shortened(text)} ({options.told(error)}). It needs pip install '.[sb3]'"
         must = f"must be a model that its algorithm saved; got {got}"
         raise options.ConfigError.of("policy", must, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.

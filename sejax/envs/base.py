@@ -151,3 +151,9 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
     faults = [f"{x} is {got.get(x)}, not {wanted.get(x)}" for x in keys]
     must = f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}"
     options.require(not faults, "env", must, fix="Cast in reset_env and step_env what differs.")
+    at_limit = getattr(type(env), "is_truncated", Environment.is_truncated)
+    if at_limit.__module__.startswith(("sejax.", "gymnax.")):  # else the limit is the user's own
+        times = jax.jit(lambda key: [x["state"].time for x in step(key)])(jax.random.key(0))
+        is_counted = isinstance(times[0], jax.core.Tracer) or times[0] != times[1]
+        must = "must count its steps, or no episode reaches the step limit"
+        options.require(is_counted, "env", must, got=name, fix="Add 1 to state.time in step_env.")

@@ -92,8 +92,7 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
         return jnp.array([state.position, state.velocity])
 
     def is_terminated(self, state: CarState, params: CarParams) -> Bool[Array, ""]:
-        is_there = state.position >= params.goal_position
-        return is_there * (state.velocity >= params.goal_velocity)
+        return (state.position >= params.goal_position) * (state.velocity >= params.goal_velocity)
 
 
 # --- the tasks -----------------------------------------------------------------------------------

@@ -73,8 +73,7 @@ def single_best(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandida
 
 def single_better(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     """As `single_best`, but only if that candidate is better than the incumbent."""
-    better = _advantage(scores, incumbent) > 0
-    return jnp.where(better, single_best(scores, incumbent), 0.0)
+    return jnp.where(_advantage(scores, incumbent) > 0, single_best(scores, incumbent), 0.0)
 
 
 def all_better_1(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:

@@ -41,8 +41,7 @@ def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
     low = _mix(low ^ _mix(jnp.uint32(step)))
     high = _mix(high + low * jnp.uint32(WEYL) + jnp.uint32(step))
     count = (1 + jnp.arange(num * size, dtype=jnp.uint32)) * jnp.uint32(WEYL)
-    is_low = jnp.arange(num * size) % 2 == 0
-    hashed = _mix(jnp.where(is_low, low, high) + count)
+    hashed = _mix(jnp.where(jnp.arange(num * size) % 2 == 0, low, high) + count)
     keys = jax.random.wrap_key_data(hashed.reshape(num, size), impl=jax.random.key_impl(key))
     return tuple(keys[i] for i in range(num))
 

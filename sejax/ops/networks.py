@@ -94,9 +94,7 @@ class Dense(nn.Module):
         fan_in = x.shape[0]
         kernel = self.param("kernel", uniform_fan_in(fan_in), (self.features, fan_in))
         bias = self.param("bias", uniform_fan_in(fan_in), (self.features,))
-        if x.ndim == 1:
-            return kernel @ x + bias
-        return affine(kernel, bias, x)
+        return kernel @ x + bias if x.ndim == 1 else affine(kernel, bias, x)
 
 
 # A product over at most this many terms is written out as a sum. XLA fuses it with the operations
@@ -148,16 +146,14 @@ def _transposed_product(
     (num_outputs, num_inputs), batch = kernel.shape, gradient.shape[1]
     if min(num_outputs, num_inputs) < _WIDE or batch >= 2 * num_outputs:
         return _product(kernel.T, gradient)
-    rows = jax.lax.optimization_barrier(gradient.T)
-    return jax.lax.optimization_barrier(rows @ kernel).T
+    return jax.lax.optimization_barrier(jax.lax.optimization_barrier(gradient.T) @ kernel).T
 
 
 def _product(a: Float[Array, "rows inner"], b: Float[Array, "inner batch"]) -> Array:
     inner = a.shape[1]
     if inner > _MAX_UNROLLED:
         return a @ b
-    terms = [a[:, i : i + 1] * b[i : i + 1] for i in range(inner)]
-    return functools.reduce(jnp.add, terms)
+    return functools.reduce(jnp.add, [a[:, i : i + 1] * b[i : i + 1] for i in range(inner)])
 
 
 class MLP(nn.Module):

@@ -119,7 +119,7 @@ def require(holds: object, field: str, message: str, **details: Unpack[Details])
 
 def require_package(field: str, package: str, extra: str) -> None:
     """Raises `ConfigError` unless a package is installed that comes with an extra of sejax."""
-    message = f"needs the package {package}. Run pip install 'sejax[{extra}]'."
+    message = f"needs the package {package}. Run pip install '.[{extra}]' in sejax's folder."
     require(importlib.util.find_spec(package), field, message)
 
 
@@ -287,6 +287,8 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         must = f"be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     use = "VALUE" if is_open else as_text(default)
+    if isinstance(got, Mapping):
+        must = "have no fields"
     if must == "be a valid tuple":
         must, use = "be a list in brackets", f"[{shortened(got, 20)}]"
     raise ConfigError.of(name, f"must {must}", got=repr(got), use=use)

@@ -235,7 +235,7 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
       ConfigError: if `config` is neither, or if it makes an object of another class or none.
     """
     cls = resolve_name(GROUPS[group].makes)
-    if isinstance(config, cls) or not isinstance(config, Makes):
+    if isinstance(config, cls | type) or not isinstance(config, Makes):
         return require_part(group, cls, config)
     key = (group, config if is_hashable(config) else id(config), *arguments)
     if key not in _PARTS:
@@ -314,8 +314,9 @@ def imported(field: str, path: str) -> Any:
     try:
         return resolve_name(path)
     except Exception as error:
-        hint = "" if place_of(error) else " Is its folder in PYTHONPATH?"
-        must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}.{hint}"
+        is_lost = isinstance(error, ModuleNotFoundError) and not place_of(error)
+        must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}."
+        must += " Is its folder in PYTHONPATH?" * is_lost
         raise ConfigError.of(field, must) from error
 
 

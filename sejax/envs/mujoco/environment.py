@@ -72,7 +72,7 @@ class MujocoTask(Options):
         except (ImportError, ConfigError) as error:
             why = str(error)
             if isinstance(error, ImportError):
-                why = f"needs the extra; {error}. Type pip install 'sejax[mujoco]'"
+                why = f"needs the extra; {error}. Type pip install '.[mujoco]'"
             raise ConfigError(f"env={self.name} {why}{self.otherwise}.", "env") from error
         return Task.of(self.spec, name=self.name, env=MujocoEnv(self))
 

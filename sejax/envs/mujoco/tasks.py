@@ -91,7 +91,7 @@ class HalfCheetah(MujocoTask):
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
             must = f"must be mujoco without brax; got {self.backend} ({error})"
-            fix = "Install it with pip install 'sejax[brax]'."
+            fix = "Install it with pip install '.[brax]'."
             raise ConfigError.of("env.backend", must, fix=fix) from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
