@@ -54,5 +54,4 @@ def test_students_of_an_se_take_no_real_step_and_those_of_an_rn_do():
 
 def test_costs_are_those_of_the_card():
     for card in sejax.pretrained():
-        costs = proxy_users.costs_of(card.name)
-        assert costs["learning_steps"] == card.learning.real_steps > 0
+        assert proxy_users.costs_of(card.name)["learning_steps"] == card.learning.real_steps > 0

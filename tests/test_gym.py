@@ -479,7 +479,7 @@ def test_an_option_that_cannot_be_is_one_message(field, options):
 def test_without_stable_baselines3_one_message_says_what_to_install(monkeypatch):
     for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"pip install 'sejax\[sb3\]'"):
+    with pytest.raises(ConfigError, match=r"pip install '.\[sb3\]'"):
         sejax.gym.make_sb3("cartpole")
 
 
