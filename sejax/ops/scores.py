@@ -20,7 +20,7 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
     return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
 
 
-def reaches(score: Any, goal: Any) -> Any:
+def reaches(score: Array | float, goal: float) -> Any:
     """Whether mean scores reach a goal, but for rounding; none reaches infinity."""
     return score >= goal - _TIE * (1 + abs(goal))
 
