@@ -284,7 +284,7 @@ def _reported(
         record = record or json.loads(proxy.path.with_name("run.json").read_text())
     cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
     if cost:  # "never" if agents trained on the proxy do not reach the solved score
-        saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * (returns[OWN] >= goal)
+        saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * reaches(returns[OWN], goal)
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"
     teaches = "its reward teaches" if is_rn else "its dynamics teach"  # an RN's are the task's
     verdict = verdict_of(judgements.values(), teaches)

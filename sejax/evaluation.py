@@ -240,11 +240,12 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-    require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
+    fix = "Set agent=sejax.make_agent(config, task)."
+    require_part("agent", Agent, agent, fix)
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_part("training", TrainingConfig, training)
     sizes, must = sizes_of(task.observation, task.action), "must be made for a task of such spaces"
-    is_fit, fix = agent.spec.sizes in (None, sizes), "Set agent=sejax.make_agent(config, task)."
+    is_fit = agent.spec.sizes in (None, sizes)
     require(is_fit, "agent", f"{must} as {task.name}", got=agent.spec.sizes, fix=fix)
     most = 1000 * max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
     must = f"must be at most {most:,}, as an agent may never end a test"

@@ -260,7 +260,7 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
     ("proxy=real env=cartpole training.max_steps=9", "training"),
     ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
-    ("proxy=cartpole agent.discount=0.5", "agent.discount"),
+    ("proxy=cartpole agent.discount=0.5", "agent.discount"), ("proxy=real env.length=2", "env"),
     ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
     ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture"),

@@ -151,13 +151,13 @@ def as_rollout(batch):
     return Rollout(np.concatenate([pack_all(batch), ended[:, None]], axis=1))
 
 
-def test_a_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind="vector"):
-    batch, state = random_batch(1, kind), fresh(kind)
+def test_a_rollout_gets_the_bonus_first_and_then_trains_the_models_once():
+    batch, state = random_batch(1, "vector"), fresh("vector")
     rollout = as_rollout(batch)
     # The bonus by the models as they were.
-    before = update_of(kind)(KEY, fresh(kind, learning_rate=0), batch)
-    trained = update_of(kind)(KEY, state, batch)
-    after = update_of(kind)(KEY, state, rollout)
+    before = update_of("vector")(KEY, fresh("vector", learning_rate=0), batch)
+    trained = update_of("vector")(KEY, state, batch)
+    after = update_of("vector")(KEY, state, rollout)
     np.testing.assert_allclose(bonus(after, batch), bonus(before, batch), rtol=1e-5, atol=1e-5)
     assert_close(after.params, trained.params, rtol=1e-5, atol=1e-6)
     assert np.abs(bonus(trained, batch) - bonus(before, batch)).max() > 1e-4

@@ -21,7 +21,10 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
 
 
 def reaches(score: Array | float, goal: float) -> Any:
-    """Whether mean scores reach a goal, but for rounding; none reaches infinity."""
+    """Whether scores, `[*n]` of any library, reach a goal, but for rounding as in `is_tie`.
+
+    None reaches infinity, which stands for a task without a solved score.
+    """
     return score >= goal - _TIE * (1 + abs(goal))
 
 

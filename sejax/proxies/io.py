@@ -297,9 +297,8 @@ def save_set(
     require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
     must = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(discount is not None or not env.config.needs_discount, "discount", must)
-    gamma = options.checked(
-        1.0 if discount is None else discount, options.Fraction, "discount", 1.0
-    )
+    gamma = 1.0 if discount is None else discount
+    gamma = options.checked(gamma, options.Fraction, "discount", 1.0)
     try:
         stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
     except (ValueError, TypeError) as error:

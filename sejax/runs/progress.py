@@ -71,9 +71,8 @@ class RunProgress:
         env, proxy = to_plain(self._config.env, "env"), self._config.name("proxy")
         named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
         named["exploration"] = self._config.name("exploration")
-        words = "".join(
-            f" {shlex.quote(f'{x}={text}')}" for x, text in named.items() if ":" in text
-        )
+        typed = [shlex.quote(f"{name}={text}") for name, text in named.items() if ":" in text]
+        words = "".join(f" {word}" for word in typed)
         words += " agent_hparams=as_learned" if ":" in named["agents"] else ""
         texts = {name: repr(value) for name, value in env.items()}
         texts |= {k: f"float('{x}')" for k, x in env.items() if x in (np.inf, -np.inf)}

@@ -180,10 +180,10 @@ def _summary(
     """Writes `run.json`, unless the same is there, and returns its content."""
     file, generations = directory.folder / "run.json", len(directory.rows)
     agents = sum(bilevel.evaluate.num_trainings)  # of a generation
-    measured = state.best_generation >= 0
+    is_measured = state.best_generation >= 0
     counts = {
-        "ended": "solved" if state.solved else "finished" if measured else "diverged",
-        "best_score": float(state.best_score) if measured else None,
+        "ended": "solved" if state.solved else "finished" if is_measured else "diverged",
+        "best_score": float(state.best_score) if is_measured else None,
         "solved_score": bilevel.solved_score,
         "generations": generations,
         "agents": generations * agents,
