@@ -242,8 +242,7 @@ def make_bilevel(
     """
     require_part("task", Task, task)
     proxy = make("proxy", proxy, task)
-    must = f"must be of the given task; got one of {proxy.task.name}. Set task to the proxy's."
-    require(proxy.task is task, "proxy", must)
+    require(proxy.task is task, "proxy", "must be of the given task object. Set task=proxy.task.")
     objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
@@ -258,16 +257,15 @@ def make_bilevel(
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )
-    must = "must be false, as scores of this objective and task cannot say solved; got true."
-    require(not stop_when_solved or bilevel.solved_score is not None, "stop_when_solved", must)
+    can_stop = bilevel.solved_score is not None or not stop_when_solved
+    require(can_stop, "stop_when_solved", "must be false, as these scores cannot say solved.")
     return bilevel
 
 
 def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None:
     """Checks that a strategy, which may be the user's own, asks for the population that it says."""
     asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
-    size = strategy.population_size
-    must = f"must ask for population_size vectors of {mean.size} numbers, in pairs if antithetic"
-    is_whole = asked.shape == (size, mean.size) and not (strategy.antithetic and size % 2)
-    got = f"{asked.shape}, population_size={size}, antithetic={strategy.antithetic}"
-    require(is_whole, "es", must, got=got)
+    shape = (strategy.population_size, mean.size)
+    require(asked.shape == shape, "es", f"must ask for candidates {shape}", got=asked.shape)
+    is_paired = not strategy.antithetic or shape[0] % 2 == 0
+    require(is_paired, "es", "must be even, as it is antithetic", got=shape[0])

@@ -172,15 +172,13 @@ def _judgeable(config: CheckConfig) -> Proxy:
     require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
     proxy = loaded(config)
     task = proxy.task
-    must = "must be proxy, as agents of a reward network train as on the task. Set real_training.*."
     is_idle = proxy.env.is_real and config.training_from != "proxy"
-    require(not is_idle, "training_from", must)
+    require(not is_idle, "training_from", "must be left out for an RN. Set real_training.*.")
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
     require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     have_one = all(hasattr(agent, "discount") for agent in config.agents.values())
-    got = ", ".join(config.agents)
-    require(have_one, "agent", "must have a discount", got=got, fix="Set agent=NAME.")
+    require(have_one, "agent", "must have a discount", got=", ".join(config.agents), use="NAME")
     zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
     require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
     return proxy

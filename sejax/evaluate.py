@@ -108,8 +108,8 @@ class EvaluateConfig(CommandConfig):
           ConfigError: without a proxy; for agents of the proxy that are neither registered nor
             typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
         """
-        fix = "Set proxy=RUN_DIR, FILE, cartpole (shipped), or real env=cartpole."
-        require("proxy" in typed, "proxy", f"must be given. {fix}")
+        fix = "Set proxy=RUN_DIR, FILE, cartpole, or real."
+        require("proxy" in typed, "proxy", "must be given", fix=fix)
         names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
         is_learned = hparams == "as_learned" or (not names and hparams is None)
         stored, learned, default = None, Tree(), ""
@@ -118,13 +118,12 @@ class EvaluateConfig(CommandConfig):
                 stored = header.read(str(typed["proxy"]), "proxy").header
                 default = agents.default_for(stored.spec)
         if stored:
-            are_same = names in ({}, compose.names_of(stored.config["agents"]))
-            must = f"must be the proxy's with agent_hparams=as_learned; got {', '.join(names)}"
-            is_clear = are_same or hparams != "as_learned"
-            require(is_clear, "agents", f"{must}. Set agent_hparams=default.")
             learned = agents_in(stored.config, imports, is_learned)
-            must = "must be left out for a proxy whose file has no agents"
-            require(learned or hparams != "as_learned", "agent_hparams", f"{must}.")
+            if hparams == "as_learned":
+                require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
+                are_same = names in ({}, compose.names_of(stored.config["agents"]))
+                fix = "Set agent_hparams=default."
+                require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and is_learned:
             stored_name = learned["exploration"]["name"]
             if typed.get("exploration", {}).get("name", stored_name) != stored_name:
@@ -288,9 +287,8 @@ def loaded(config: EvaluateConfig) -> Proxy:
 
 def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
     """How long agents train on an SE, by the SE's file."""
-    must = "must be config for an SE whose file does not say how long agents train"
     use = "config training.max_steps=2000 training.max_episodes=2000"
-    require("training" in proxy.config, "training_from", must, use=use)
+    require("training" in proxy.config, "training_from", "must be config for this SE", use=use)
     test_episodes = config.real_training.test_episodes
     return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, sizes_of
+from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, require_agent, sizes_of
 from sejax.agents.buffers import no_buffer
 from sejax.agents.varied import for_keys
 from sejax.envs.base import Task
@@ -240,17 +240,12 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-    fix = "Set agent=sejax.make_agent(config, task)."
-    require_part("agent", Agent, agent, fix)
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_agent(agent, task.observation, task.action)
     require_part("training", TrainingConfig, training)
-    sizes, must = sizes_of(task.observation, task.action), "must be made for a task of such spaces"
-    is_fit = agent.spec.sizes in (None, sizes)
-    require(is_fit, "agent", f"{must} as {task.name}", got=agent.spec.sizes, fix=fix)
-    most = 1000 * max(training.max_steps or LARGEST, 1000)  # a shorter training is a trial
-    must = f"must be at most {most:,}, as an agent may never end a test"
-    got = f"{task.max_steps:,} for {task.name}"
-    require(task.max_steps <= most, "env.max_steps", must, got=got, use="N, or Task(max_steps=N)")
+    # An agent may never end a test. A training of less than 1,000 steps is a trial.
+    most, got = 1000 * max(training.max_steps or LARGEST, 1000), task.max_steps
+    require(got <= most, "env.max_steps", f"must be at most {most:,}", got=f"{got:,}", use=1000)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)

@@ -86,8 +86,7 @@ class Objective:
         """
         score = (for_people and self.shown) or self.score
         scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
-        must = f"must score each agent, {shape}; got {scores.shape}. Set axis=-1 in sums."
-        require(scores.shape == shape, "objective", must)
+        require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
         return jnp.where(outcome.nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 
 
@@ -162,9 +161,8 @@ class RewardThreshold(ObjectiveConfig):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        must = f"must be another one, as {task.name} has no solved reward"
         fix = "Set env.solved_reward=N, or objective=max_reward."
-        require(task.is_solvable, "objective", must, got="reward_threshold", fix=fix)
+        require(task.is_solvable, "objective", f"needs {task.name}'s solved reward", fix=fix)
 
         def score(outcome: Outcome) -> Array:
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)

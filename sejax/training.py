@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentState, Hparams, sizes_of
+from sejax.agents.base import Agent, AgentState, Hparams, require_agent
 from sejax.agents.buffers import Buffer, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
@@ -26,7 +26,7 @@ from sejax.ops.loops import STEPS_PER_CHECK, while_any_active
 from sejax.ops.modes import require_modes
 from sejax.ops.parallel import in_batches_on_cpu
 from sejax.ops.scores import reaches
-from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require, shortened
+from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require
 from sejax.options.registry import require_part
 from sejax.proxies.base import is_real, proxy_in
 
@@ -95,11 +95,9 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
     if not training.is_fixed_length:
         return
     assert training.max_steps is not None
-    episodes = -(-training.max_steps // max_episode_steps)
-    got = training.max_episodes
-    must = f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of"
-    must += f" at most {max_episode_steps} steps"
-    require(got >= episodes, f"{name}.max_episodes", must, got=got, use=episodes)
+    least, got = -(-training.max_steps // max_episode_steps), training.max_episodes
+    must = f"must suffice for {name}.max_steps={training.max_steps}"
+    require(got >= least, f"{name}.max_episodes", must, got=got, use=least)
 
 
 @struct.dataclass
@@ -214,14 +212,10 @@ def make_trainer(
       >>> result.returns.shape
       (8, 20)
     """
-    require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
     require_own_steps(env)
-    sizes = sizes_of(*spaces_of(env))
-    must = f"must be made for the environment's {sizes}; got one for {shortened(agent.spec.sizes)}"
-    fix = "Set agent=sejax.make_agent(config, task) with that task."
-    require(agent.spec.sizes in (None, sizes), "agent", f"{must}. {fix}")
-    fix = "Set agent=sejax.make_agent(config, task); sejax.make_evaluator draws them."
-    require(agent.varied is None, "agent", "must have fixed hyperparameters here", fix=fix)
+    require_agent(agent, *spaces_of(env))
+    fix = "sejax.make_evaluator draws others."
+    require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
     require_part("training", TrainingConfig, training)
     require_modes()
     if training.num_tests_between and test_fn is None:

@@ -25,7 +25,7 @@ from sejax.agents.buffers import rollout_buffer as rollout_buffer
 from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import ConfigError, registry, shortened
+from sejax.options import ConfigError, registry, require
 from sejax.options.registry import require_part
 
 DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
@@ -105,15 +105,12 @@ def require_fit(
     """
     name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
-        known = fitting(spec)
-        must = f"must be one of {', '.join(known) or 'your own'} in {task_name} with"
-        must += f" {spec.states} states and {spec.actions} actions"
-        fix = f"Set agent={known[0]}." if known and field == "agent" else "Leave it out."
-        raise ConfigError.of(field, must, got=name, fix=fix)
-    if exploration.states is not None and agent.states not in (None, exploration.states):
-        must = f"must be one for {agent.states} states with agent={shortened(name)}"
-        got = registry.name_of("exploration", exploration)
-        raise ConfigError.of("exploration", must, got=got, use="none")
+        known = fitting(spec) or ["MODULE:NAME"]
+        must = f"must be one of {', '.join(known)} in {task_name}"
+        raise ConfigError.of(field, must, got=name, use=known[0])
+    is_fit = exploration.states is None or agent.states in (None, exploration.states)
+    got = registry.name_of("exploration", exploration)
+    require(is_fit, "exploration", f"must be for {agent.states} states", got=got, use="none")
 
 
 def default_for(spec: TaskSpec) -> str:

@@ -12,7 +12,8 @@ from jaxtyping import Array, Int, PyTree
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.spec import Space
-from sejax.options import Options, WholeNumber, marks
+from sejax.options import Options, WholeNumber, marks, require
+from sejax.options.registry import require_part
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -54,6 +55,18 @@ class ActFn(Protocol):
 def sizes_of(observation: Space, action: Space) -> tuple[tuple[str, int], ...]:
     """Kind and size of the observations and of the actions that an agent is made for."""
     return tuple((type(space).__name__, space.size) for space in (observation, action))
+
+
+def require_agent(agent: "Agent", observation: Space, action: Space) -> None:
+    """Checks that it is an agent, and made for these spaces.
+
+    Raises:
+      ConfigError: if it is not.
+    """
+    fix = "Set agent=sejax.make_agent(config, task) with this task."
+    require_part("agent", Agent, agent, fix)
+    got, sizes = agent.spec.sizes, sizes_of(observation, action)
+    require(got in (None, sizes), "agent", f"must be made for {sizes}", got=got, fix=fix)
 
 
 @dataclass(frozen=True, kw_only=True)

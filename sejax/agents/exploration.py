@@ -37,8 +37,7 @@ def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agen
     Its state holds the inner agent's state as `agent_state`. Its hyperparameters hold the inner
     agent's as `agent`.
     """
-    fix = "Call sejax.make_agent(config, task, exploration, varied=True)."
-    require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
+    require(agent.varied is None, "agent", "must be varied last, by sejax.make_agent(varied=True).")
 
     def begin_episode(state: AgentState, episode: Array) -> AgentState:
         return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))

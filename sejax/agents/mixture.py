@@ -73,11 +73,10 @@ class Mixture:
         size = len(self.agents)
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
+        sizes = {size, len(self.names), len(self.weights)}
+        require(len(sizes) == 1, "agents", "must have a name and a weight each", got=self.names)
         is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
-        is_whole = is_weighted and len(self.names) == len(self.weights) == size
-        must = "must have a name and a weight each, one above 0 and none below"
-        got = f"{size} agents, weights={self.weights} and names={self.names}"
-        require(is_whole, "agents", must, got=got, fix="Set names=() and weights=().")
+        require(is_weighted, "weights", "must be from 0, and one above", got=self.weights, use="()")
         for agent in self.agents:
             require_part("agent", Agent, agent)
 
@@ -113,7 +112,7 @@ class Mixture:
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
-        got = f"{num_dealt} perturbations for weights {self.weights}"
+        got = population_size
         require(are_enough, "es.population_size", "must leave each agent one", got=got, use=size)
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)

@@ -51,8 +51,7 @@ class OffPolicyOptions(AgentOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         most, got = self.buffer_size, self.batch_size
-        must = f"must be at most agent.buffer_size={most}; got {got}. Set agent.buffer_size={got}."
-        require(got <= most, "agent.batch_size", must)
+        require(got <= most, "agent.batch_size", "must fit agent.buffer_size", got=got, use=most)
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""

@@ -26,7 +26,7 @@ from sejax.agents.policies import select_action
 from sejax.envs.base import Task
 from sejax.ops.networks import init_narrowed
 from sejax.ops.optimizers import ADAM
-from sejax.options import Finite, Fraction, NonNegative, Positive, option, require, shortened
+from sejax.options import Finite, Fraction, NonNegative, Positive, option, require
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
@@ -61,11 +61,10 @@ class SACConfig(ActorCriticOptions):
         Raises:
           ConfigError: if the target entropy of the other kind of actions is set.
         """
-        kinds = ("target_entropy", "target_entropy_fraction")
-        used, unused = kinds if task.num_actions is None else kinds[::-1]
-        got, default = (getattr(config, unused) for config in (self, type(self)))
-        message = f"must stay {default} with {task.name}'s actions; got {shortened(got)}."
-        require(got == default, f"agent.{unused}", f"{message} Set agent.{used} in its place.")
+        is_continuous = task.num_actions is None
+        unused = "target_entropy_fraction" if is_continuous else "target_entropy"
+        is_default = getattr(self, unused) == getattr(type(self), unused)
+        require(is_default, f"agent.{unused}", f"must be left out for {task.name}'s actions.")
         if task.num_actions is None:
             return SAC(self, task.obs_dim, task.action_dim, task.max_action).agent()
         return DiscreteSAC(self, task.obs_dim, task.num_actions).agent()

@@ -120,8 +120,8 @@ def _of_sb3(text: str, task: Task) -> Actor:
         raise options.ConfigError.of("policy", must, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     is_discrete, space = task.num_actions is not None, model.action_space
-    must = f"must have the actions of {task.name}"
-    require(hasattr(space, "n") == is_discrete, "policy", must, got=space, fix=FIX)
+    is_fit = hasattr(space, "n") == is_discrete
+    require(is_fit, "policy", f"must have the actions of {task.name}", got=space, fix=FIX)
     low, high = np.asarray((-1, 1) if is_discrete else (space.low, space.high), float)
     middle, factor = (low + high) / 2, 2 * task.max_action / (high - low)
     return lambda obs: (model.predict(obs, deterministic=True)[0] - middle) * factor

@@ -78,9 +78,8 @@ class PolicySearchConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        most = self.num_directions
-        must = f"must be at most all directions; got {self.num_top} of {most}"
-        require(self.num_top <= most, "search.num_top", must, use=most)
+        most, got = self.num_directions, self.num_top
+        require(got <= most, "search.num_top", "must fit num_directions", got=got, use=most)
 
 
 class Policy(NamedTuple):

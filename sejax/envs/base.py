@@ -72,9 +72,8 @@ class Task(TaskSpec):
         solved_reward = options.as_python(self.solved_reward)
         is_nan = type(solved_reward) in (int, float) and math.isnan(solved_reward)
         is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
-        fix = "Set env.solved_reward=inf if it is undefined"
-        must = f"must be a number; got {options.shortened(solved_reward)}. {fix}."
-        options.require(is_known, "env.solved_reward", must)
+        field = "env.solved_reward"
+        options.require(is_known, field, "must be a number", got=solved_reward, use="inf")
         try:
             params = env.default_params if params is None else params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
@@ -89,11 +88,9 @@ class Task(TaskSpec):
         except options.ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
-            results = "obs, state, reward, terminated and info"
-            fix = f" Derive it from gymnax's Environment, whose step_env returns {results}."
-            raised = f"{name} raised {options.told(error)}.{'' if options.place_of(error) else fix}"
-            must = f"must be a gymnax 1.x environment, in JAX, with EnvParams; {raised}"
-            raise options.ConfigError.of("env", must) from error
+            must = "must be a gymnax 1.x environment (obs, state, reward, terminated, info)"
+            message = f"{must}; {name} raised {options.told(error)}."
+            raise options.ConfigError.of("env", message) from error
         known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)
@@ -155,5 +152,4 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
     if at_limit.__module__.startswith(("sejax.", "gymnax.")):  # else the limit is the user's own
         times = jax.jit(lambda key: [x["state"].time for x in step(key)])(jax.random.key(0))
         is_counted = isinstance(times[0], jax.core.Tracer) or times[0] != times[1]
-        must = "must count its steps, or no episode reaches the step limit"
-        options.require(is_counted, "env", must, got=name, fix="Add 1 to state.time in step_env.")
+        options.require(is_counted, "env", "must add 1 to state.time in step_env", got=name)

@@ -170,6 +170,5 @@ def _of_gymnax(space: Any, what: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
         return Box(low, high)
-    must = f"must have {what} in a gymnax Box or Discrete space"
-    fix = "Make them one array in a subclass of sejax.envs.wrappers.Wrapper."
-    raise ConfigError.of("env", must, got=repr(space), fix=fix)
+    fix = "Make them one array in a sejax.envs.wrappers.Wrapper."
+    raise ConfigError.of("env", f"must have {what} in a Box or Discrete", got=repr(space), fix=fix)

@@ -50,8 +50,7 @@ class GymnaxTask(Options):
         try:
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
-            raised = f"{gymnax_id} raised {options.told(error)}"
-            must = f"must be an environment that gymnax can make here; {raised}."
+            must = f"must be one that gymnax makes; {gymnax_id} raised {options.told(error)}."
             raise options.ConfigError.of("env", must) from error
         usual = SOLVED_REWARD.get(gymnax_id, math.inf)
         solved = usual if self.solved_reward is None else self.solved_reward

@@ -204,9 +204,8 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
         has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32
     if isinstance(action, Box):
         low, high = np.array(action.low), np.array(action.high)
-        fix = "Give its action space a finite low and high."
         is_bounded = np.isfinite([low, high]).all() and (low < high).all()
-        require(is_bounded, "env", "must have bounded actions", got=action, fix=fix)
+        require(is_bounded, "env", "must have actions with a finite low < high", got=action)
         is_vector = len(shape) == 1 and len({*-low, *high}) == 1  # the same [-x, x] everywhere
     if has_plain_obs and (isinstance(action, Discrete) or is_vector):
         return env

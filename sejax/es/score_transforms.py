@@ -116,12 +116,11 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
             with jax.ensure_compile_time_eval():
                 weights = np.asarray(jax.jit(function)(scores), float)
         except Exception as error:
-            must = "must be a function of scores [pop] that jax can trace"
-            raise ConfigError.of(FIELD, f"{must}; {choice} raised {told(error)}.") from error
+            message = f"must take scores in jax; {choice} raised {told(error)}."
+            raise ConfigError.of(FIELD, message) from error
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
-        got = f"got {weights.tolist()!s:.60} of shape {list(weights.shape)} for the scores"
-        must = f"must give a finite weight for each of {pop} scores; {got} {scores.tolist()!s:.40}"
-        require(is_fit, FIELD, f"{must}. Mend {choice}, or set {FIELD}=rank.")
+        must, got = f"must give {pop} finite weights for {pop} scores", weights.tolist()
+        require(is_fit, FIELD, must, got=got, fix=f"Mend {choice}, or set {FIELD}=rank.")
 
     def transform(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
         weights = jnp.asarray(function(or_lowest_finite(scores)), jnp.float32)

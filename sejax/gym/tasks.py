@@ -132,13 +132,13 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
         env = gymnasium.make(task, max_episode_steps=limit, disable_env_checker=True)
         task = RealTask.of_env(env)
     has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
-    must = f"must have the SE's step limit, {limit}, and its actions, {learned.action_space}"
-    got = f"{task.max_steps} and {task.action_space}"
-    is_same = has_limit and task.action_space == learned.action_space
-    require(is_same, "task", must, got=got, fix="Set max_steps, or wrap it in RescaleAction.")
+    require(has_limit, "task", f"must have max_steps={limit}", got=task.max_steps)
+    got, actions = task.action_space, learned.action_space
+    fix = "Wrap it in RescaleAction."
+    require(got == actions, "task", f"must have actions of {actions}", got=got, fix=fix)
     seen, known = task.observation_space, learned.observation_space
-    must = f"must have the SE's observations, {shortened(known)}"
-    require(signature(seen) == signature(known), "task", must, got=seen)
+    is_seen, must = signature(seen) == signature(known), f"must observe {shortened(known)}"
+    require(is_seen, "task", must, got=seen)
     return replace(task, observation_space=known)
 
 

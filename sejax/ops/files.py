@@ -36,8 +36,7 @@ def require_writable(field: str, folder: Path) -> None:
             pass
         remove_empty(new_folders)
     except (OSError, ValueError) as error:
-        must = "must be a folder that can be written"
-        raise ConfigError.of(field, must, got=error, use="FOLDER") from error
+        raise ConfigError.of(field, "must be a writable folder", got=error, use="FOLDER") from error
 
 
 def missing(folder: Path) -> list[Path]:

@@ -113,8 +113,9 @@ def spread_groups_over_devices(
     for name, count in (("devices", num_devices), ("num_parallel", num_parallel)):
         checked(count, Count, name, None)
     available = jax.devices()
-    must = f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null."
-    require(num_devices is None or num_devices <= len(available), "devices", must)
+    most = len(available)
+    is_fit = num_devices is None or num_devices <= most
+    require(is_fit, "devices", f"must be at most {most}", got=num_devices, use="null")
     mesh = _mesh(num_devices)
     widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 

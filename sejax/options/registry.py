@@ -171,12 +171,11 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
     plugin = imported(group, path or name)
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
-    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
+    base = resolve_name(GROUPS[group].base)
     is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
     is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a dataclass with make({', '.join(arguments)}) that derives"
-    must += f" from {base.__module__}.{base.__name__}; got {shortened(name)}, which is"
-    require(is_fit, group, f"{must} {shortened(plugin)}.")
+    must = f"must name a function, or a {base.__module__}.{base.__name__} with make()"
+    require(is_fit, group, must, got=f"{shortened(name, 40)}, which is {plugin}")
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
         _NAMES[plugin] = name
     return plugin
@@ -265,8 +264,7 @@ def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
       ConfigError: for anything else.
     """
     fix = fix or "Pass an object; sejax.config([...]) takes names."
-    must = f"must be a sejax.{cls.__name__}"
-    require(isinstance(part, cls), group, must, got=repr(part), fix=fix)
+    require(isinstance(part, cls), group, f"must be a sejax.{cls.__name__}", got=part, fix=fix)
     return cast(T, part)
 
 

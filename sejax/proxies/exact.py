@@ -95,8 +95,7 @@ def require_vectors(task: Task) -> None:
     Raises:
       ConfigError: if they are not.
     """
-    must = "must have vectors as observations"
-    require(task.num_states is None, "env", must, got=task.name, use="cartpole")
+    require(task.num_states is None, "env", "must observe vectors", got=task.name, use="cartpole")
 
 
 def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:

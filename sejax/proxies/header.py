@@ -194,11 +194,12 @@ def read(
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         must = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
         raise ConfigError.of(option, must) from error
-    must = f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}"
-    got = f"got proxy={shortened(header.kind, 40)} in {where}"
-    require(not kinds or header.kind in kinds, option, f"{must}; {got}.")
-    must = f"must be a single proxy; got a set in {where}. sejax.load_set reads sets."
-    require(len(header.proxies) == 1 or not single, option, must)
+    is_kind, known = not kinds or header.kind in kinds, " or ".join(map(str, kinds))
+    require(
+        is_kind, option, f"must have proxy={known}", got=f"{shortened(header.kind, 20)} in {where}"
+    )
+    is_one = len(header.proxies) == 1 or not single
+    require(is_one, option, f"must be a single proxy. sejax.load_set reads the set {where}.")
     if single and header.is_set:  # a set of one
         tensors = {name: x[0] for name, x in tensors.items()}
         header = dataclasses.replace(header, is_set=False)
@@ -220,7 +221,6 @@ def check_tensors(
       ConfigError: for other names, shapes or types, or numbers that are not finite.
     """
     got = {name: x.shape for name, x in tensors.items()}
+    require(got == shapes, field, f"must have the shapes {shortened(shapes)}", got=got, use=fix)
     are_numbers = all(x.dtype == np.float32 and np.isfinite(x).all() for x in tensors.values())
-    must = f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}"
-    others = shortened(got, 60) if got != shapes else "other numbers"
-    require(got == shapes and are_numbers, field, f"{must}; got {others}. Set {field} to {fix}.")
+    require(are_numbers, field, "must hold finite float32 numbers", use=fix)

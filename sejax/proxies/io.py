@@ -452,9 +452,8 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
                 raise
             known = json.dumps([learned.interface, learned.config["env"]], sort_keys=True)
             real = _absent_task(learned.task, known, str(error))
-    must = f"must be a proxy of the task {real.name}"
-    got = f"one of {shortened(learned.task, 30)} in {where}"
-    require(learned.task == real.name, option, must, got=got, fix="Set another task.")
+    got = f"{shortened(learned.task, 30)} in {where}"
+    require(learned.task == real.name, option, f"must be of the task {real.name}", got=got)
     if task is not None:
         limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
         wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))

@@ -193,8 +193,8 @@ class RewardEnv(ProxyEnv):
           ConfigError: if the reward needs a discount and the agent has none.
         """
         is_known = discount is not None or not self.config.needs_discount
-        must = f"must have a discount for {self.config.variant}"
-        require(is_known, "agent", f"{must}; got none. Set Agent(discount=lambda hparams: ...).")
+        fix = "Set Agent(discount=lambda hparams: ...)."
+        require(is_known, "agent", f"must have a discount for {self.config.variant}", fix=fix)
         potentials = None
         sees_info = self.config.shaping.weighs_info or self._augmented_keys
         if self.task.num_states is not None and not sees_info:

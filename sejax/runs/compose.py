@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import yaml
 
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Options, listed, nearest, old, registry, require, shortened
+from sejax.options import ConfigError, Options, old, registry, require, require_known, shortened
 from sejax.options.plain import expanded, fields_of, flatten, merge, split, unquoted
 from sejax.options.registry import key_of
 
@@ -71,9 +71,8 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
         fix = shortened(f"{text.rstrip(',')}]" if is_open else first)
-        message = "must be one value: brackets close and hold no space, and a comma outside of them"
-        message += f" makes a sweep; got {shortened(text)}. Set {name}={fix}."
-        require(not (others or is_open), name, message)
+        message = "must be one value; a list stands in brackets, without spaces"
+        require(not (others or is_open), name, message, got=text, use=fix)
         texts[CHOICES.get(name, name)] = text
     return texts
 
@@ -119,8 +118,7 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
-        got = f"{shortened(path, 40)} ({shortened(error, 120)})"
-        must = f"must be a name, or a YAML file of fields; got {got}"
+        must = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
         raise ConfigError.of("preset", must, use="best") from error
 
 
@@ -260,10 +258,7 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     name = str(typed.get("preset", "best"))
     env, proxy, es = (choice(typed.get(group, {}), group) for group in ("env", "proxy", "es"))
     sections = sections_of(env, proxy)
-    if name not in sections:
-        ranked = nearest(name, sections)
-        must = f"must be one that {shortened(env)} has ({listed(ranked)})"
-        raise ConfigError.of("preset", must, got=name, use=ranked[0])
+    require_known("preset", name, sections)
     section = sections[name]
     default = registry.find("proxy", proxy, imports).default_objective
     objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))

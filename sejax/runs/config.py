@@ -104,8 +104,7 @@ class CommandConfig(Options):
         known = {field.name for field in dataclasses.fields(cls)}
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
-        must = "must be agents by keys that are words"
-        require(is_map, "agents", must, got=by_key, use="[ddqn,ppo]")
+        require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         first, *others = by_key
         with errors_of("" if others else f"agents.{shortened(first, 40)}", "agent"):
             config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
@@ -157,9 +156,8 @@ class CommandConfig(Options):
         """
         longest, got = proxy.max_steps(spec.max_steps), training.solved_by
         require_reachable(group, training, longest)
-        must = "must be test, as returns on a proxy say nothing"
         is_tested = training.stop_rule != "solved" or got == "test"
-        require(is_tested, f"{group}.solved_by", must, got=got, use="test")
+        require(is_tested, f"{group}.solved_by", "must be test on a proxy", got=got, use="test")
         # The shortest episodes: of other proxies they may have one step.
         shortest = longest if proxy.reaches_step_limit else 1
         for name, length, unit in (("max_steps", shortest, 1), ("max_episodes", longest, longest)):
@@ -212,8 +210,7 @@ class LearnConfig(CommandConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
-        message = f"must be left out with machines; got {self.devices}. Set machines.workers=N."
-        require(is_here, "devices", message)
+        require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
         is_alone, given = len(self.agents) == 1, self.mixture.weights

@@ -92,9 +92,8 @@ class RayConfig(Options):
                 warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            must = f"must be a cluster that can be reached; got {self.address} ({told(error)})"
-            fix = "Start one with ray start --head, or set machines.address=local."
-            raise ConfigError.of("machines.address", must, fix=fix) from error
+            must = f"must be within reach; got {self.address} ({told(error)})"
+            raise ConfigError.of("machines.address", must, use="local") from error
         try:
             yield functools.partial(_on_cluster, self)
         finally:
@@ -282,8 +281,7 @@ def call(versions: dict[str, str], function: Callable[..., Any], item: tuple[Any
     _use_one_core()
     if (here := runtime.versions()) != versions:
         got = f"{here} on {socket.gethostname()} and {versions} here"
-        must = f"must have the same versions everywhere; got {got}"
-        raise ConfigError.of("machines", must, fix="Install the same versions there.")
+        raise ConfigError.of("machines", f"must have the same versions everywhere; got {got}.")
     runtime.configure_jax()
     return function(*item)
 

@@ -151,6 +151,6 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
         got = f"{shortened(name)} ({told(error)[:120]})"
         raise ConfigError.of("space", f"{must}; got {got}", use="paper_se") from error
     foreign = [text for text in texts.values() if ":" in str(text)]
-    must = f"must name no module, as a file may not; got {shortened(', '.join(foreign))}"
-    require(not foreign, "space", f"{must}. Type this range on the command line.")
+    fix = "Type this range on the command line."
+    require(not foreign, "space", "must name no module", got=", ".join(foreign), fix=fix)
     return {str(field): parse(str(field), str(text)) for field, text in texts.items()}

@@ -90,9 +90,8 @@ class HalfCheetah(MujocoTask):
 
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
-            must = f"must be mujoco without brax; got {self.backend} ({error})"
-            fix = "Install it with pip install '.[brax]'."
-            raise ConfigError.of("env.backend", must, fix=fix) from error
+            needs = f"needs brax ({error}). Run pip install '.[brax]'."
+            raise ConfigError.of("env.backend", needs) from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
