@@ -458,7 +458,7 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
 
 
 @pytest.mark.parametrize("make, field", [
-    (lambda agent, task: make_trainer(task.env, agent), "agent"),
+    (lambda agent, task: make_trainer(task.env, agent), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
     (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, training()), "task"),
     (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),

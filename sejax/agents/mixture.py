@@ -76,7 +76,7 @@ class Mixture:
         sizes = {size, len(self.names), len(self.weights)}
         require(len(sizes) == 1, "agents", "must have a name and a weight each", got=self.names)
         is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
-        require(is_weighted, "weights", "must be from 0, and one above", got=self.weights, use="()")
+        require(is_weighted, "agents", "must have weights from 0, one above", got=self.weights)
         for agent in self.agents:
             require_part("agent", Agent, agent)
 

@@ -88,9 +88,8 @@ class Task(TaskSpec):
         except options.ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
-            must = "must be a gymnax 1.x environment (obs, state, reward, terminated, info)"
-            message = f"{must}; {name} raised {options.told(error)}."
-            raise options.ConfigError.of("env", message) from error
+            must = f"must be a gymnax 1.x environment; {name} raised {options.told(error)}."
+            raise options.ConfigError.of("env", must) from error
         known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)

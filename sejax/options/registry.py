@@ -171,10 +171,11 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
     plugin = imported(group, path or name)
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
-    base = resolve_name(GROUPS[group].base)
+    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
     is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
     is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a {base.__module__}.{base.__name__} with make()"
+    must = f"must name a function, or a dataclass with make({', '.join(arguments)})"
+    must += f" that derives from {base.__module__}.{base.__name__}"
     require(is_fit, group, must, got=f"{shortened(name, 40)}, which is {plugin}")
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
         _NAMES[plugin] = name
