@@ -123,25 +123,15 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 
 def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
-    proxy, learned = _judgeable(config), dict[str, Any](config.agents)
-    task = proxy.task
-    names = agents.fitting(task) if config.algorithms is None else config.algorithms
-    same = {registry.name_of("agent", agent) for agent in learned.values()}
-    with errors_of("agent", "algorithms"):
-        others = {x: configure("agent", {"name": x}) for x in names if x not in {*same, *learned}}
+    proxy = _judgeable(config)
+    task, learned, others = proxy.task, config.agents, _others(config, proxy)
+    myopic = _myopic(learned) if proxy.env.max_steps > 1 else {}
     students = learned | others
-    for key, agent in students.items():
-        field = config.field_of(key) if key in learned else "algorithms"
-        agents.require_fit(agent, config.exploration, task, task.name, field)
-    myopic = dict[str, dict[str, AgentConfig]]()
-    tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
-    for x in DISCOUNTS if proxy.env.max_steps > 1 else ():
-        sighted = {
-            f"{k}-{x:g}": dataclasses.replace(a, **{"discount": x}) for k, a in learned.items()
-        }
-        myopic[f"the proxy, discount {x:g}"], students = sighted, students | sighted
+    for of_discount in myopic.values():
+        students |= of_discount
     worlds = setup_of(dataclasses.replace(config, agents=students))[0].values()
     on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
+    tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
     on_task.trainings[tuned] = config.real_training
     config = dataclasses.replace(config, agents=students | {tuned: _tuned(task)})
     name = as_file_name(config.proxy.removesuffix(".safetensors"))
@@ -185,6 +175,32 @@ def _judgeable(config: CheckConfig) -> Proxy:
 
 
 # --- who trains where -----------------------------------------------------------------------------
+
+
+def _others(config: CheckConfig, proxy: Proxy) -> dict[str, AgentConfig]:
+    """Agents of algorithms that the proxy was not learned with.
+
+    Raises:
+      ConfigError: if one of them, or of the proxy's agents, does not fit the task.
+    """
+    task, learned = proxy.task, config.agents
+    names = agents.fitting(task) if config.algorithms is None else config.algorithms
+    known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
+    with errors_of("agent", "algorithms"):
+        others = {x: configure("agent", {"name": x}) for x in names if x not in known}
+    for key, agent in (learned | others).items():
+        field = config.field_of(key) if key in learned else "algorithms"
+        agents.require_fit(agent, config.exploration, task, task.name, field)
+    return others
+
+
+def _myopic(learned: dict[str, AgentConfig]) -> dict[str, dict[str, Any]]:
+    """The proxy's agents with lower discounts, by row of the table and by key."""
+    rows = dict[str, dict[str, Any]]()
+    for x in DISCOUNTS:
+        with_it = ((key, dataclasses.replace(a, **{"discount": x})) for key, a in learned.items())
+        rows[f"the proxy, discount {x:g}"] = {f"{key}-{x:g}": agent for key, agent in with_it}
+    return rows
 
 
 def _tuned(task: Task) -> AgentConfig:
