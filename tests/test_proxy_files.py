@@ -151,6 +151,7 @@ ODD_VALUES = {  # of entries of the metadata, by their place
     ("config",): [MISSING, None, [], 3],
     ("config", "env"): [MISSING, None, [], "cartpole", {}, {"name": 3}, {"name": None},
                         {"name": ["x"]}, {"name": "gridworld_2x2", "new": 1}],
+    ("config", "agents"): ["x", 3, [3]],
     ("config", "proxy"): [MISSING, None, {"name": "rn", "hidden_size": "x"},
                           {"name": "rn", "new": 1}],
     ("task",): [MISSING, None, [], "t" * 10_000],

@@ -10,7 +10,7 @@ import pytest
 from support import refusal, refused
 
 from sejax.ops.checksummed import DamagedError, pack, unpack
-from sejax.runs.store import Store
+from sejax.runs.store import LOCK, Store
 
 SETTINGS = {"env": {"name": "cartpole"}, "seed": 0, "sizes": (1, 2), "devices": 1}
 
@@ -103,6 +103,10 @@ def test_a_folder_is_a_processs_own_until_it_is_killed_and_unused_it_is_removed(
         assert refused(Store(folder, SETTINGS).__enter__) == "run_dir"
         store.put("rounds")
     assert store.get("rounds") == ({}, {})
+    with Store(folder, SETTINGS) as first:
+        (folder / LOCK).unlink()  # by hand, as if it were stale
+        with Store(folder, SETTINGS), pytest.raises(FileNotFoundError):
+            first.put("rounds")
     with Store(tmp_path / "other", SETTINGS):
         pass
     assert not (tmp_path / "other").exists()

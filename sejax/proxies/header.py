@@ -191,17 +191,15 @@ def read(
     try:
         tensors, plain = checksummed.read(path, KIND)
         header = from_plain(Header, plain, "header")
-    except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
+    except (OSError, LookupError, AttributeError, ValueError, TypeError, ArithmeticError) as error:
         must = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
         raise ConfigError.of(option, must) from error
-    is_kind, known = not kinds or header.kind in kinds, " or ".join(map(str, kinds))
-    require(
-        is_kind, option, f"must have proxy={known}", got=f"{shortened(header.kind, 20)} in {where}"
-    )
+    is_kind, got = not kinds or header.kind in kinds, f"{shortened(header.kind, 20)} in {where}"
+    require(is_kind, option, f"must have proxy={' or '.join(map(str, kinds))}", got=got)
     is_one = len(header.proxies) == 1 or not single
     require(is_one, option, f"must be a single proxy. sejax.load_set reads the set {where}.")
     if single and header.is_set:  # a set of one
-        tensors = {name: x[0] for name, x in tensors.items()}
+        tensors = {name: x[0] if x.shape[:1] == (1,) else x for name, x in tensors.items()}
         header = dataclasses.replace(header, is_set=False)
     return Stored(path, tensors, header)
 

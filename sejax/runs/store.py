@@ -5,7 +5,9 @@ It is written to a temporary file, put on the disk, and renamed over the previou
 at any moment leaves a whole entry, the new or the previous one.
 """
 
+import contextlib
 import json
+import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Self, TypeAlias
@@ -71,6 +73,7 @@ class Store:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
+            self._locked = os.stat(self.folder / LOCK)
         except (OSError, ValueError, NotImplementedError) as error:
             is_used = isinstance(error, filelock.Timeout)
             why = "which another process uses" if is_used else shortened(error)
@@ -80,10 +83,17 @@ class Store:
 
     def __exit__(self, *_: object) -> None:
         """Unlocks the folder; if it has no entry, removes what `with` has made."""
-        if self._lock.is_locked and not self._has_entry:
+        if self._is_held() and not self._has_entry:
             (self.folder / LOCK).unlink(missing_ok=True)
             remove_empty(self._new_folders)
         self._lock.release()
+
+    def _is_held(self) -> bool:
+        """Whether the lock in the folder is this process's: a removed one may be another's now."""
+        with contextlib.suppress(OSError):
+            locked = os.stat(self.folder / LOCK)
+            return self._lock.is_locked and os.path.samestat(locked, self._locked)
+        return False
 
     def file(self, name: str) -> Path:
         """The file of an entry."""
@@ -126,7 +136,7 @@ class Store:
           OSError: if it cannot be written, or the folder was removed since it was locked; the
             previous entry is then whole.
         """
-        if self._lock.is_locked and not (self.folder / LOCK).exists():
+        if self._lock.is_locked and not self._is_held():
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
         manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
         write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
