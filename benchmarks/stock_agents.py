@@ -368,11 +368,14 @@ def summarise(
                   & (table.num_episodes == args.episodes)]
             for table in (taught, real)
         )  # fmt: skip
-        here = mine[mine.steps == steps]
+        here = mine[(mine.steps == steps) & (mine.total_steps == max(args.steps))]
+        zoo = ZOO.get((kind_of(agent), TASKS[args.task][0]))
+        total = zoo.total_steps if args.real_steps and zoo else max(args.steps)
+        alone = theirs[theirs.total_steps == total]
         there = theirs[(theirs.steps == steps) & (theirs.total_steps == max(args.steps))]
         beside = {
             "real task": round(there.mean_return.mean(), 1),
-            "real steps to be as good": as_good(theirs, here.mean_return.mean(), len(seeds)),
+            "real steps to be as good": as_good(alone, here.mean_return.mean(), len(seeds)),
         }
         yield {
             "agent": agent,

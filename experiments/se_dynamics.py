@@ -155,7 +155,8 @@ def test(
     learner = next(iter(se.learned_agents().values()))
     tables.append(se_myopia.train_with_discounts(own, condition("discount-", learner)))
     settings.shards.made_with |= own.shards.made_with
-    return pd.concat(tables, ignore_index=True).reindex(columns=list(TESTS))
+    rows = agents.worst_for_diverged(pd.concat(tables, ignore_index=True), kind)  # of all students
+    return rows.reindex(columns=list(TESTS))
 
 
 def summarise(curves: pd.DataFrame, agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:

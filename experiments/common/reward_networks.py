@@ -266,7 +266,8 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
-    free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
+    counted = {"generations", "stop_when_solved"}
+    free = run_directory.FREE_FIELDS - counted | {"num_parallel", "num_seeds"}
     flat = flatten(config.plain())
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
