@@ -65,7 +65,6 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
 
 @pytest.mark.parametrize(("make", "field"), [
     (lambda: Mixture(agents=()), "agents"),
-    (lambda: Mixture(agents=AGENTS, names=("a",)), "agents"),
     (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
     (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
     (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),

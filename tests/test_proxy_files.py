@@ -148,10 +148,9 @@ def test_a_file_that_is_damaged_or_foreign_is_refused(path):
 MISSING = object()
 ODD_VALUES = {  # of entries of the metadata, by their place
     ("format_version",): [MISSING, None, 0, 1, 3, "x", 2.5, [], True, "9" * 10_000],
-    ("config",): [MISSING, None, [], 3],
+    ("config",): [MISSING, None, [], 3], ("config", "agents"): ["x", 3, [3]],
     ("config", "env"): [MISSING, None, [], "cartpole", {}, {"name": 3}, {"name": None},
                         {"name": ["x"]}, {"name": "gridworld_2x2", "new": 1}],
-    ("config", "agents"): ["x", 3, [3]],
     ("config", "proxy"): [MISSING, None, {"name": "rn", "hidden_size": "x"},
                           {"name": "rn", "new": 1}],
     ("task",): [MISSING, None, [], "t" * 10_000],
