@@ -150,10 +150,10 @@ def make_tester(
 def make_recorder(
     agent: Agent, task: Task, num_episodes: int
 ) -> Callable[[Array, AgentState], Steps]:
-    """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
+    """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * decisions, ...]`.
 
     The episodes are those of `make_tester` with the same key. A decision is one step here, even if
-    the agent repeats its action.
+    the agent repeats its action: an episode has `max_steps / action_repeat` of them, rounded up.
     """
     begin, decide = _greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
 
@@ -257,7 +257,7 @@ def make_evaluator(
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
             tests = test(key_test, result.agent_state, active, test_params)
-            real_steps = tests.num_steps.sum() + result.eval_steps
+            real_steps = tests.num_steps.sum() + result.test_steps
             return Outcome(
                 test_returns=tests.returns,
                 scored_returns=tests.scored,

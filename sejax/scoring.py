@@ -136,7 +136,7 @@ class Scoring:
         """
         scores = self._scores(self.objective(outcome))
         by_candidate = scores.population.reshape(-1, self.evaluations.num_evals)
-        population = self.evaluations.population_scores(by_candidate)
+        population = self.evaluations.candidate_scores(by_candidate)
         return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
 
     def for_people(self, outcome: Outcome) -> Scores:
@@ -181,7 +181,7 @@ class Scoring:
             incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
-        aggregate = jnp.mean if self.mixture.config.aggregate == "mean" else jnp.min
+        aggregate = jnp.mean if self.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
             incumbent=incumbent,

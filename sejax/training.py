@@ -116,7 +116,7 @@ class TrainResult:
         after the last.
       nonfinite: whether a number that is not finite was met: an output of a proxy, or
         a float of the agent's state.
-      eval_steps: real steps spent on tests between training episodes, `[]` int32.
+      test_steps: real steps spent on tests between training episodes, `[]` int32.
       stored: arrays of the agent's buffer at the end, if the trainer keeps them; else None.
     """
 
@@ -127,7 +127,7 @@ class TrainResult:
     test_returns: Float[Array, " max_episodes"] | None
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
-    eval_steps: Array
+    test_steps: Array
     stored: PyTree = None
 
 
@@ -156,7 +156,7 @@ class _LoopState:
     agent_state: AgentState
     recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
     nonfinite: Array
-    eval_steps: Array
+    test_steps: Array
     tested: Array  # mean return of the last tests
 
 
@@ -197,7 +197,7 @@ def make_trainer(
 
     Raises:
       ConfigError: for arguments of the wrong kind, or if `training` has a fixed number of steps and
-        too few episodes for them.
+        too few episodes for them, or stops at a solved reward that is not given.
       ValueError: if tests are asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
@@ -217,6 +217,8 @@ def make_trainer(
     fix = "sejax.make_evaluator draws others."
     require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
     require_part("training", TrainingConfig, training)
+    can_stop = training.stop_rule != "solved" or solved_reward is not jnp.inf
+    require(can_stop, "solved_reward", "must be given with stop_rule=solved")
     require_modes()
     if training.num_tests_between and test_fn is None:
         number = training.num_tests_between
@@ -293,9 +295,9 @@ class _Loop:
         curve = {"returns": no_returns, "episode_ends": jnp.zeros(max_episodes, jnp.int32)}
         if self.test_fn is not None:
             curve["test_returns"] = no_returns
-        body, per_check = self.step, STEPS_PER_CHECK
+        body, per_check = partial(self.step, buffer), STEPS_PER_CHECK
         if buffer.learns_every > 1:
-            body, per_check = partial(self.rollout, buffer.learns_every), 1
+            body, per_check = partial(self.rollout, buffer), 1
         (stored, curve), state = while_any_active(
             body, (buffer.init(), curve), state, (key_steps, env_params), per_check
         )
@@ -305,7 +307,7 @@ class _Loop:
             episodes=state.episode,
             **{"test_returns": None} | curve,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
-            eval_steps=state.eval_steps,
+            test_steps=state.test_steps,
             stored=stored if self.keeps_stored else None,
         )
 
@@ -324,7 +326,7 @@ class _Loop:
             agent_state=self.agent.begin_episode(agent_state, jnp.int32(0)),
             recent=jnp.zeros(2 * self.training.window),
             nonfinite=jnp.bool_(False),
-            eval_steps=jnp.int32(0),
+            test_steps=jnp.int32(0),
             tested=jnp.float32(0),
         )
 
@@ -341,23 +343,24 @@ class _Loop:
         return self.agent.buffer(jax.eval_shape(example), most)
 
     def rollout(
-        self, length: int, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+        self, buffer: Buffer, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
     ) -> tuple[PyTree, _LoopState]:
-        """Makes `length` steps and learns from them. A training that ends before learns nothing."""
+        """Fills the buffer and learns from it. A training that ends before learns nothing."""
 
         def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
             large, state = carry
             # Masked always: the training may end within these steps.
-            large, stepped = self.step(large, state, consts, masked=True, learns=False)
+            large, stepped = self.step(buffer, large, state, consts, masked=True, learns=False)
             return large, jax.tree.map(partial(jnp.where, state.active), stepped, state)
 
         first_step = state.step
-        large, state = jax.lax.fori_loop(0, length, step, (large, state))
+        large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
         (stored, _), (key, _) = large, consts
-        last = dataclasses.replace(state, step=state.step - 1)
+        is_full = state.step == first_step + buffer.learns_every
+        keys = _StepKeys(*step_keys(key, state.step - 1, 6))
         agent_state = jax.lax.cond(
-            (state.step == first_step + length) & (state.episode >= self.agent.spec.learns_from),
-            partial(self.learn, stored, None, last, _StepKeys(*step_keys(key, last.step, 6))),
+            is_full & (state.episode >= self.agent.spec.learns_from),
+            partial(self.learn, buffer, stored, None, state.step, keys),
             lambda agent_state: agent_state,
             state.agent_state,
         )
@@ -365,19 +368,26 @@ class _Loop:
 
     def learn(
         self,
+        buffer: Buffer,
         stored: PyTree,
         transition: Transition | None,
-        state: _LoopState,
+        num_steps: Array,
         keys: _StepKeys,
         agent_state: AgentState,
     ) -> AgentState:
-        """One update, after `state.step`, which made `transition`; of a rollout it is None."""
+        """One update after `num_steps`, of which the last made `transition`; of a rollout None."""
         in_use = self.agent.batch_size(agent_state)
-        batch = self.buffer(state).batch(keys.sample, stored, state.step + 1, transition, in_use)
+        batch = buffer.batch(keys.sample, stored, num_steps, transition, in_use)
         return self.agent.update(keys.update, agent_state, batch)
 
     def step(
-        self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool, learns: bool = True
+        self,
+        buffer: Buffer,
+        large: PyTree,
+        state: _LoopState,
+        consts: PyTree,
+        masked: bool,
+        learns: bool = True,
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (stored, curve), (key, env_params) = large, consts
@@ -395,12 +405,12 @@ class _Loop:
         transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # not in a training that is over
-        stored = self.buffer(state).store(stored, state.step, transition, ended, active)
+        stored = buffer.store(stored, state.step, transition, ended, active)
         agent_state = state.agent_state
         if learns:
             agent_state = jax.lax.cond(
                 state.episode >= self.agent.spec.learns_from,
-                partial(self.learn, stored, transition, state, keys),
+                partial(self.learn, buffer, stored, transition, state.step + 1, keys),
                 lambda agent_state: agent_state,
                 agent_state,
             )
@@ -439,7 +449,7 @@ class _Loop:
         if self.test_fn is not None:
             tested, num_steps = self.test_fn(keys.test, state.agent_state, finished)
             state = dataclasses.replace(
-                state, tested=tested, eval_steps=state.eval_steps + num_steps
+                state, tested=tested, test_steps=state.test_steps + num_steps
             )
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])

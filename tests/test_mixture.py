@@ -32,7 +32,7 @@ AGENTS = tuple(
 
 def mixture(num=2, weights=(), **config):
     """A mixture of which nobody looks at the agents."""
-    return Mixture(agents=AGENTS[:1] * num, weights=weights, config=MixtureConfig(**config))
+    return Mixture(agents=AGENTS[:1] * num, weights=weights, **config)
 
 
 # --- which agent trains where --------------------------------------------------------------------
@@ -224,7 +224,7 @@ def test_the_columns_of_each_agent_are_means_over_its_trainings(two):
 def told(incumbents, state=None, stop_when_solved=True, candidates=(0, 0), **config):
     """State and info after a generation whose candidates and incumbent returned these."""
     bilevel = bilevel_of(
-        Mixture(agents=AGENTS, config=MixtureConfig(**config)), stop_when_solved=stop_when_solved,
+        Mixture(agents=AGENTS, **config), stop_when_solved=stop_when_solved,
         es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=len(incumbents)),
     )  # fmt: skip
     outcome = outcome_of([*candidates, *incumbents])

@@ -267,7 +267,7 @@ def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_
         agent_state=None, train_steps=jnp.int32(17), episodes=jnp.int32(2),
         returns=jnp.array([-5.0, -3.0, jnp.nan]), test_returns=None,
         episode_ends=jnp.array([4, 10, 0]), nonfinite=jnp.bool_(False),
-        eval_steps=jnp.int32(0),
+        test_steps=jnp.int32(0),
     )  # fmt: skip
     assert area_under_curve(result, jnp.float32(-2.0)) == -5 * 4 - 3 * 6 - 2 * 7
     tested = result.replace(test_returns=jnp.array([-1.0, -4.0, jnp.nan]))  # where there are some

@@ -112,7 +112,7 @@ def test_training_equals_a_plain_python_loop(variant, scripted):
     np.testing.assert_array_equal(result.episode_ends, [*ends, *[0] * unfinished])
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
-    assert result.eval_steps == 0 and result.test_returns is None
+    assert result.test_steps == 0 and result.test_returns is None
 
 
 @pytest.mark.parametrize(("variant", "num_episodes"), [
@@ -124,7 +124,7 @@ def test_tests_between_episodes_are_recorded_and_decide_if_the_rule_asks_for_the
 ):
     result = trainer(variant)(KEY, script([3] * 12, [1] * 12))
     unfinished = [np.nan] * (12 - num_episodes)
-    assert result.episodes == num_episodes and result.eval_steps == num_episodes * 3
+    assert result.episodes == num_episodes and result.test_steps == num_episodes * 3
     np.testing.assert_array_equal(result.returns, [3] * num_episodes + unfinished)
     np.testing.assert_array_equal(result.test_returns, [*range(-1, num_episodes - 1), *unfinished])
 

@@ -42,7 +42,8 @@ def make_agent(
     exploration: ExplorationConfig = NoExploration(),
     varied: bool = False,
 ) -> Agent:
-    """The agent for a task's observations and actions; the same object for the same arguments.
+    """The agent for a task's observations and actions; the same object for the same arguments
+    that can be hashed.
 
     Args:
       config: configuration of the agent, such as `DDQNConfig()`.

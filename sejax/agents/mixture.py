@@ -48,7 +48,7 @@ class Mixture:
       names: of the agents, for tables; their numbers if not given.
       weights: shares of the candidates that each agent trains on; equal if not given. An agent of
         weight 0 trains on the incumbent alone.
-      config: how the agents' scores are combined.
+      aggregate: whether the mean of the agents' scores counts, or the worst.
 
     Raises:
       ConfigError: without agents, unless each has a name and a weight, for a weight below 0, if
@@ -67,7 +67,7 @@ class Mixture:
     agents: tuple[Agent, ...]
     names: tuple[str, ...] = ()
     weights: tuple[float, ...] = ()
-    config: MixtureConfig = MixtureConfig()
+    aggregate: Literal["mean", "min"] = "mean"
 
     def __post_init__(self) -> None:
         size = len(self.agents)
@@ -112,8 +112,8 @@ class Mixture:
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
-        got = population_size
-        require(are_enough, "es.population_size", "must leave each agent one", got=got, use=size)
+        must = f"must be larger: {population_size} candidates do not suffice for the agents' shares"
+        require(are_enough, "es.population_size", must, use=size)
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 

@@ -54,8 +54,8 @@ class PolicySearchConfig(Options):
       constant: Share of the generations after which the step size declines, to a tenth at the end.
       policy_error: Root mean square of an episode's error, in units of the action's bound; for
         discrete actions, in units of the policy's own outputs.
-      alive_bonus: Subtracted from each step's reward in the search; if not given, the task's reward
-        for being healthy.
+      alive_bonus: Subtracted from each step's reward in the search; the commands set it to the
+        task's reward for being healthy.
       num_tests: episodes without the error
       until_solved: Whether the search ends as soon as a tested policy solves the task.
     """

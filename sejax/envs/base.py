@@ -48,8 +48,8 @@ class Task(TaskSpec):
         by hand: whoever loads a proxy of it must pass the task.
 
     Raises:
-      ConfigError: for an observation or action space that is neither discrete nor a bounded box, or
-        an environment that cannot be reset and stepped.
+      ConfigError: for spaces that are neither discrete nor boxes, actions without bounds, and an
+        environment that cannot be reset and stepped.
 
     Example:
       >>> import gymnax

@@ -64,22 +64,22 @@ class GridWorld(Environment[GridState, GridParams]):
         cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._default_params = params or GridParams()
-        self._start = int(np.flatnonzero(cells == "S")[0])
-        self._goal = (cells == "G").ravel()  # [num_states]
-        self._hole = (cells == "O").ravel()  # [num_states]
-        self._next = _next_indices(cells)  # [num_states, 4]
+        self.start_index = int(np.flatnonzero(cells == "S")[0])
+        self.is_goal = (cells == "G").ravel()  # [num_states]
+        self.is_hole = (cells == "O").ravel()  # [num_states]
+        self.next_indices = _next_indices(cells)  # [num_states, 4]
 
     def start(self, key: Array) -> GridState:
         """Puts the agent on the map's S; the key has no effect."""
-        return GridState(index=jnp.int32(self._start), time=0)
+        return GridState(index=jnp.int32(self.start_index), time=0)
 
     def step_env(
         self, key: Array, state: GridState, action: Array, params: GridParams
     ) -> Step[GridState]:
         """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
-        index = jnp.asarray(self._next)[state.index, action]
+        index = jnp.asarray(self.next_indices)[state.index, action]
         state = GridState(index=index, time=state.time + 1)
-        is_hole, is_goal = jnp.asarray(self._hole)[index], jnp.asarray(self._goal)[index]
+        is_hole, is_goal = jnp.asarray(self.is_hole)[index], jnp.asarray(self.is_goal)[index]
         reward = jnp.where(is_hole, params.hole_reward, params.step_reward)
         reward = jnp.where(is_goal, params.goal_reward, reward)
         return self.after(state, reward, params)
@@ -88,7 +88,7 @@ class GridWorld(Environment[GridState, GridParams]):
         return state.index
 
     def is_terminated(self, state: GridState, params: GridParams) -> Bool[Array, ""]:
-        return jnp.asarray(self._goal | self._hole)[state.index]
+        return jnp.asarray(self.is_goal | self.is_hole)[state.index]
 
 
 def _next_indices(cells: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ class Evaluations(Options):
         numbers = np.concatenate([of_population, of_incumbent])
         return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
-    def population_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
+    def candidate_scores(self, scores: Float[Array, "pop evaluation"]) -> Float[Array, " pop"]:
         """A score for each candidate; nan if the agent of one evaluation diverged."""
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 

@@ -180,7 +180,7 @@ class GridWorld(gymnasium.Env[int, int]):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
         """Puts the agent on the map's S; `options` has no effect."""
         super().reset(seed=seed)
-        self._index = start = self._world._start
+        self._index = start = self._world.start_index
         return start, {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, Info]:
@@ -194,8 +194,8 @@ class GridWorld(gymnasium.Env[int, int]):
             raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"{action!r} is none of {self.action_space}")
-        obs, params = int(self._world._next[self._index, action]), self._params
-        is_goal, is_hole = bool(self._world._goal[obs]), bool(self._world._hole[obs])
+        obs, params = int(self._world.next_indices[self._index, action]), self._params
+        is_goal, is_hole = bool(self._world.is_goal[obs]), bool(self._world.is_hole[obs])
         at_end = params.goal_reward if is_goal else params.hole_reward
         terminated = is_goal or is_hole
         self._index = None if terminated else obs

@@ -21,7 +21,7 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
 
 
 def reaches(score: Array | float, goal: float) -> Any:
-    """Whether scores, `[*n]` of any library, reach a goal, but for rounding as in `is_tie`.
+    """Whether scores, `[*n]` of any library, reach a goal, but for rounding.
 
     None reaches infinity, which stands for a task without a solved score.
     """

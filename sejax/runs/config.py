@@ -9,7 +9,7 @@ themselves.
 import contextlib
 import dataclasses
 import textwrap
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +57,7 @@ IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams",
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandConfig(Options):
+class CommandConfig(Options, ABC):
     """What runs and evaluations share.
 
     Attributes:
@@ -241,8 +241,12 @@ class LearnConfig(CommandConfig):
         """The objects that the configuration describes: the arguments of `sejax.make_learner`."""
         task, how_made = self.task(), (self.exploration, self.agent_hparams == "varied")
         learners = tuple(agents.make_agent(x, task, *how_made) for x in self.agents.values())
-        names, weights = tuple(self.agents), tuple(self.mixture.weights.values())
-        mixture = Mixture(agents=learners, names=names, weights=weights, config=self.mixture)
+        mixture = Mixture(
+            agents=learners,
+            names=tuple(self.agents),
+            weights=tuple(self.mixture.weights.values()),
+            aggregate=self.mixture.aggregate,
+        )
         return {
             "task": task,
             "agent": mixture if len(learners) > 1 else learners[0],

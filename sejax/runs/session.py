@@ -52,12 +52,12 @@ def run(
     start_wall_s = float(directory.last("wall_s")) - time.monotonic()
     start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
-    drawn, agents = time.monotonic(), sum(bilevel.evaluate.num_trainings)  # of a generation
+    drawn, num_trainings = time.monotonic(), sum(bilevel.evaluate.num_trainings)
     folder, first = directory.folder.resolve(), len(directory.rows)
     run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
     with contextlib.closing(GuardedTracker(config.tracker, run, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
-            if first and all(float(x["num_nonfinite"]) == agents for x in directory.rows):
+            if first and all(float(x["num_nonfinite"]) == num_trainings for x in directory.rows):
                 break  # every agent of every generation has diverged
             (directory.folder / "run.json").unlink(missing_ok=True)  # of fewer generations
             length = min(config.checkpoint_every, config.generations - first)
@@ -179,15 +179,16 @@ def _summary(
 ) -> dict[str, Any]:
     """Writes `run.json`, unless the same is there, and returns its content."""
     file, generations = directory.folder / "run.json", len(directory.rows)
-    agents = sum(bilevel.evaluate.num_trainings)  # of a generation
+    num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
     is_measured = state.best_generation >= 0
+    means = [float(x["train_steps_mean"]) for x in directory.rows]
     counts = {
         "ended": "solved" if state.solved else "finished" if is_measured else "diverged",
         "best_score": float(state.best_score) if is_measured else None,
         "solved_score": bilevel.solved_score,
         "generations": generations,
-        "agents": generations * agents,
-        "train_steps": sum(round(float(x["train_steps_mean"]) * agents) for x in directory.rows),
+        "agents": generations * num_trainings,
+        "train_steps": sum(round(mean * num_trainings) for mean in means),
         "real_steps": int(directory.last("env_steps_total")),
     }
     with contextlib.suppress(OSError, ValueError, TypeError):  # none, or damaged
