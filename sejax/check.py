@@ -36,7 +36,7 @@ from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted
 from sejax.envs.base import Task
 from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
-from sejax.myopia import ENOUGH, judge, verdict_of
+from sejax.myopia import ENOUGH, Judgement, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.ops.scores import reaches
 from sejax.options import LARGEST, Count, as_text, errors_of, registry, require
@@ -275,36 +275,19 @@ def _trained(config: CheckConfig, rows: Rows, store: Store, pool: Pool) -> pd.Da
 def _reported(
     proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
 ) -> dict[str, Any]:
-    """Prints and writes the findings. Scores are returns for an SE, training steps for an RN."""
-    task, is_rn, is_lost = proxy.task, proxy.env.is_real, table["nonfinite"] > 0
-    table["test_return"] = counted(table["test_return"].mask(is_lost))
-    table["train_steps"] = table["train_steps"].mask(is_lost, table["train_steps"].max())
-    table["score"] = -table["train_steps"] if is_rn else table["test_return"]
-    table["solved"] = reaches(table["test_return"], task.solved_reward)
-    by_agent = table.groupby(["world", "agent"], sort=False)
-    scores = {name: score.to_numpy() for name, score in by_agent["score"]}
-    judgements, goal = {}, float(task.solved_reward)
-    for key in learned:
-        floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
-        myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
-        judgements[key] = judge(myopic, scores[OWN, key], floor, 0.0 if is_rn else goal)
-    shares = by_agent["solved"].mean().map("{:.0%}".format).reset_index("agent")
-    solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
+    """Prints and writes the findings."""
+    task, is_rn = proxy.task, proxy.env.is_real
+    table = _scored(table, task, is_rn)
     summary = summarise(table, ["world"])
-    steps, returns = (summary[f"{name}_mean"] for name in ("train_steps", "test_return"))
-    learning = zoo.describe(header.read(proxy.path)).learning
-    record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
-    with contextlib.suppress(OSError, ValueError):
-        record = record or json.loads(proxy.path.with_name("run.json").read_text())
-    cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
-    if cost:  # "never" if agents trained on the proxy do not reach the solved score
-        saved = (min(steps[TASK], steps[TUNED]) - is_rn * steps[OWN]) * reaches(returns[OWN], goal)
-        cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if saved > 0 else "never"
+    judgements = _judgements(table, learned, task, is_rn)
     teaches = "its reward teaches" if is_rn else "its dynamics teach"  # an RN's are the task's
     verdict = verdict_of(judgements.values(), teaches)
-    found: dict[str, Any] = {"null_se": null, "cost": cost, "verdict": verdict}
+    found = {"null_se": null, "cost": _cost(proxy, summary), "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
     printed = {name: x for name, x in found.items() if x}
+    shares = table.groupby(["world", "agent"], sort=False)["solved"].mean().map("{:.0%}".format)
+    shares = shares.reset_index("agent")
+    solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     shown = summary.set_index(solved[summary.index], append=True)
     print_table(shown, title, yaml.safe_dump(printed, sort_keys=False).strip(), SHOWN)
     found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
@@ -312,6 +295,47 @@ def _reported(
     write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")
     plots.check(table, task.solved_reward, folder / "check.png", f"{proxy.path.stem}: {verdict}")
     return found
+
+
+def _scored(table: pd.DataFrame, task: Task, is_rn: bool) -> pd.DataFrame:
+    """The table with scores: returns for an SE, minus the training steps for an RN."""
+    is_lost = table["nonfinite"] > 0
+    returns = counted(table["test_return"].mask(is_lost))
+    steps = table["train_steps"].mask(is_lost, table["train_steps"].max())
+    score, solved = -steps if is_rn else returns, reaches(returns, task.solved_reward)
+    return table.assign(test_return=returns, train_steps=steps, score=score, solved=solved)
+
+
+def _judgements(
+    table: pd.DataFrame, learned: list[str], task: Task, is_rn: bool
+) -> dict[str, Judgement]:
+    """The myopia test of each algorithm that the proxy was learned with."""
+    by_agent = table.groupby(["world", "agent"], sort=False)["score"]
+    scores = {name: score.to_numpy() for name, score in by_agent}
+    judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
+    for key in learned:
+        floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
+        myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
+        judgements[key] = judge(myopic, scores[OWN, key], floor, top)
+    return judgements
+
+
+def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
+    """What learning the proxy cost, and how many agents must train on it to save its real steps.
+
+    "never" if agents trained on the proxy do not reach the solved score.
+    """
+    learning, is_rn = zoo.describe(header.read(proxy.path)).learning, proxy.env.is_real
+    record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
+    with contextlib.suppress(OSError, ValueError):
+        record = record or json.loads(proxy.path.with_name("run.json").read_text())
+    cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
+    if cost:
+        steps, returns = summary["train_steps_mean"], summary["test_return_mean"]
+        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if is_rn else 0)
+        pays = saved > 0 and reaches(returns[OWN], float(proxy.task.solved_reward))
+        cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if pays else "never"
+    return cost
 
 
 if __name__ == "__main__":

@@ -234,7 +234,9 @@ class PPO(Algorithm):
         outputs: Any = self.critic.apply(params["critic"], obs)
         return outputs[0]
 
-    def evaluate(self, params: PyTree, obs: Array, action: Array) -> tuple[Steps, Steps, Steps]:
+    def evaluate_actions(
+        self, params: PyTree, obs: Array, action: Array
+    ) -> tuple[Steps, Steps, Steps]:
         """The actions' log probabilities, the entropies and the values."""
         outputs: Any = self.actor.apply(params["actor"], obs)
         log_prob, entropy = self.probabilities(outputs, params["std"], action)
@@ -290,7 +292,7 @@ class PPO(Algorithm):
         Source: Schulman et al. (2016), eq. 11 to 16.
         """
         hp, params, moments = state.hparams, state.params, state.return_moments
-        old_log_prob, _, value = self.evaluate(params, steps.obs, steps.action)
+        old_log_prob, _, value = self.evaluate_actions(params, steps.obs, steps.action)
         if self.config.advantages == "monte_carlo":
             decay = jnp.broadcast_to(hp.discount, ended.shape)
             returns = normalized(discounted_sums(steps.reward, decay, ended))
@@ -316,7 +318,7 @@ class PPO(Algorithm):
 
         Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
         """
-        log_prob, entropy, value = self.evaluate(params, batch.obs, batch.action)
+        log_prob, entropy, value = self.evaluate_actions(params, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
         else:

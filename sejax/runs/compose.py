@@ -114,7 +114,7 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
     try:
         values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
-        return merge(_beside(file, typed, groups), typed)
+        return merge(_without_replaced(file, typed, groups), typed)
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -122,7 +122,7 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
         raise ConfigError.of("preset", must, use="best") from error
 
 
-def _beside(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
+def _without_replaced(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
     """The tree of a file without what typed choices replace: other choices' fields, and agents."""
     for group in groups:
         name = typed.get(group, {}).get("name")
