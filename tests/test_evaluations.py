@@ -44,7 +44,7 @@ def test_with_common_random_numbers_all_agents_of_a_mixture_have_the_populations
 def test_a_member_has_no_score_if_the_agent_of_one_evaluation_diverged(aggregate, expected):
     evaluations = Evaluations(num_evals=2, aggregate=aggregate)
     scores = jnp.array([[1.0, 3.0], [2.0, NAN], [NAN, 0.0], [-4.0, -4.0]])
-    np.testing.assert_array_equal(evaluations.population_scores(scores), expected)
+    np.testing.assert_array_equal(evaluations.candidate_scores(scores), expected)
 
 
 @pytest.mark.parametrize(("scores", "members", "repaired", "mean"), [

@@ -42,7 +42,7 @@ def whole_generations(strategy):
     def tell(key, candidates, scores, state):
         of_population, of_incumbent = jnp.split(scores, [size * num_evals])
         _, incumbent = evaluations.with_diverged_last(of_incumbent, of_population)
-        scores = evaluations.population_scores(of_population.reshape(size, num_evals))
+        scores = evaluations.candidate_scores(of_population.reshape(size, num_evals))
         population = candidates[: size * num_evals : num_evals]
         return strategy.tell(key, population, scores, incumbent, state)
 
