@@ -111,8 +111,7 @@ def test_training_equals_a_plain_python_loop(variant, scripted):
     np.testing.assert_array_equal(result.returns, returns[:num_episodes] + [np.nan] * unfinished)
     np.testing.assert_array_equal(result.episode_ends, [*ends, *[0] * unfinished])
     assert result.agent_state.num_updates == updates
-    assert not result.nonfinite
-    assert result.test_steps == 0 and result.test_returns is None
+    assert not result.nonfinite and result.test_steps == 0 and result.test_returns is None
 
 
 @pytest.mark.parametrize(("variant", "num_episodes"), [
@@ -460,6 +459,7 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
 @pytest.mark.parametrize("make, field", [
     (lambda agent, task: make_trainer(task.env, agent), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
+    (lambda x, task: make_trainer(x, task.env, training(stop_rule="solved")), "solved_reward"),
     (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, training()), "task"),
     (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),
 ])  # fmt: skip

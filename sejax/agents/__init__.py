@@ -42,8 +42,7 @@ def make_agent(
     exploration: ExplorationConfig = NoExploration(),
     varied: bool = False,
 ) -> Agent:
-    """The agent for a task's observations and actions; the same object for the same arguments
-    that can be hashed.
+    """The agent for a task's observations and actions; one object for equal arguments with hashes.
 
     Args:
       config: configuration of the agent, such as `DDQNConfig()`.

@@ -61,8 +61,7 @@ class SACConfig(ActorCriticOptions):
         Raises:
           ConfigError: if the target entropy of the other kind of actions is set.
         """
-        is_continuous = task.num_actions is None
-        unused = "target_entropy_fraction" if is_continuous else "target_entropy"
+        unused = "target_entropy_fraction" if task.num_actions is None else "target_entropy"
         is_default = getattr(self, unused) == getattr(type(self), unused)
         require(is_default, f"agent.{unused}", f"must be left out for {task.name}'s actions.")
         if task.num_actions is None:

@@ -51,7 +51,8 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
     names = [field.name for field in dataclasses.fields(config)]
     how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
     is_whole = bool(how) and ("num_layers" in how) == ("hidden_size" in how)
-    require(is_whole, "agent_hparams", f"must be default with {cls.__name__}, which has no ranges.")
+    must = f"must be default, as {cls.__name__} varies nothing or half a network"
+    require(is_whole, "agent_hparams", must, got="varied", use="default")
     # Traced options first: the order decides which key draws which option.
     ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])
     return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
