@@ -96,7 +96,7 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     runtime.configure_jax()
-    findings(configuration.config(overrides, CheckConfig))
+    findings(CheckConfig.of_words(overrides))
 
 
 def help_text(overrides: Sequence[str]) -> str:
@@ -118,7 +118,7 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
       ConfigError: for an invalid field, or a proxy that cannot be judged.
     """
     words = [f"{name}={as_text(value)}" for name, value in {"proxy": proxy, **fields}.items()]
-    return findings(configuration.config(words, CheckConfig))
+    return findings(CheckConfig.of_words(words))
 
 
 def findings(config: CheckConfig) -> dict[str, Any]:

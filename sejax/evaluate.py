@@ -10,7 +10,6 @@ Writes evaluation.csv and .json into out_dir. --print-config prints the configur
 
 import contextlib
 import dataclasses
-import functools
 import itertools
 import json
 import math
@@ -182,7 +181,7 @@ def help_text(overrides: Sequence[str]) -> str:
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
-    make = functools.partial(configuration.config, command=EvaluateConfig)
+    make = EvaluateConfig.of_words
     configs = compose.swept(overrides, make, "out_dir", _folder_of, known=("proxy",))
     if len(configs) == 1:
         return configs

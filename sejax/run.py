@@ -46,7 +46,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
         return f"{config.resolved_run_dir}_{name}"
 
     known = configuration.IN_RUN_DIR
-    configs = compose.swept(overrides, configuration.config, "run_dir", folder_of, known)
+    configs = compose.swept(overrides, LearnConfig.of_words, "run_dir", folder_of, known)
     runs: list[LearnConfig] = []
     for config in configs:
         for seed in range(config.seed, config.seed + config.num_seeds):

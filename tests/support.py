@@ -230,7 +230,7 @@ def has_compiler():
 
 def evaluation(words):
     """The configuration of an evaluation."""
-    return config(words, EvaluateConfig)
+    return EvaluateConfig.of_words(words)
 
 
 def forge(path, **config):

@@ -14,7 +14,6 @@ import sejax
 from sejax.myopia import Judgement, judge, verdict_of
 from sejax.ops.checksummed import pack, unpack
 from sejax.proxies.exact import make_exact
-from sejax.runs import config as configuration
 
 checking = importlib.import_module("sejax.check")  # `sejax.check` is its function
 ROOM = ("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")
@@ -32,9 +31,8 @@ def save(path, *words):
 
 
 def run(path, **fields):
-    return checking.findings(configuration.config(
-        [f"{name}={value}" for name, value in {"proxy": path, **FEW, **fields}.items()],
-        checking.CheckConfig))  # fmt: skip
+    words = [f"{name}={value}" for name, value in {"proxy": path, **FEW, **fields}.items()]
+    return checking.findings(checking.CheckConfig.of_words(words))
 
 
 @pytest.fixture(scope="module")

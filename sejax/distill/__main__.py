@@ -135,7 +135,7 @@ def config_of(overrides: Sequence[str]) -> DistillConfig:
         is_used = name.partition(".")[0] in {*USED, *OWN}
         fix = "Set search.generations=N." if name == "generations" else "Leave it out."
         require(is_used, shortened(name, 40), "has no effect here", fix=fix)
-    config: DistillConfig = configuration.config(overrides, DistillConfig)
+    config = DistillConfig.of_words(overrides)
     require(config.agent_hparams == "default", "agent_hparams", "has no effect here. Leave it out.")
     return config
 

@@ -1,7 +1,7 @@
 """A command's configuration: from the words that a user types to typed, validated dataclasses.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` makes a tree of
-the words. `layers_of` a command puts choices and presets below it. `sejax.options.plain` makes
+the words. `CommandConfig.layers_of` puts choices and presets below it. `sejax.options.plain` makes
 dataclasses of the merged layers, and reads each value by its field's type. The dataclasses check
 themselves.
 """
@@ -93,6 +93,28 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: for an unknown choice or preset.
         """
+
+    @classmethod
+    def of_words(cls, overrides: Sequence[str]) -> Self:
+        """The configuration that the words after the command describe.
+
+        Raises:
+          ConfigError: for an unknown group, choice or field, or a value out of range.
+        """
+        layers = cls.layers_of(overrides).values()
+        return cls.of_tree(merge(*layers), compose.plugin_paths(overrides))
+
+    @classmethod
+    def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
+        """The layers that words make, by their names; the words themselves are the last one."""
+        typed = compose.tree_of(overrides, cls.groups())
+        layers = cls.layers_below(typed, compose.plugin_paths(overrides))
+        of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
+        for name, value in flatten(of_only).items():
+            fix = f"Set agents.{chosen[0]}.{name}={shortened(value)}."
+            require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
+        typed["agents"] = merge({chosen[0]: of_only}, typed["agents"])
+        return layers | {"typed": typed}
 
     @classmethod
     def of_tree(cls, tree: Tree, imports: Collection[str] | None) -> Self:
@@ -283,12 +305,8 @@ class LearnConfig(CommandConfig):
 # --- from words ----------------------------------------------------------------------------------
 
 
-def config(overrides: Sequence[str] = (), command: Any = LearnConfig) -> Any:
-    """Composes and validates a configuration from the words of the command line.
-
-    Args:
-      overrides: as typed after `python -m sejax.run`.
-      command: the class of another command's configuration.
+def config(overrides: Sequence[str] = ()) -> LearnConfig:
+    """The configuration of a run, from the words after `python -m sejax.run`.
 
     Raises:
       ConfigError: for an unknown group, choice or field, or a value out of range.
@@ -297,20 +315,7 @@ def config(overrides: Sequence[str] = (), command: Any = LearnConfig) -> Any:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    layers = layers_of(command, overrides).values()
-    return command.of_tree(merge(*layers), compose.plugin_paths(overrides))
-
-
-def layers_of(command: type[CommandConfig], overrides: Sequence[str]) -> dict[str, Tree]:
-    """The layers that a command's words make, by their names; the words are the last one."""
-    typed = compose.tree_of(overrides, command.groups())
-    layers = command.layers_below(typed, compose.plugin_paths(overrides))
-    of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
-    for name, value in flatten(of_only).items():
-        fix = f"Set agents.{chosen[0]}.{name}={shortened(value)}."
-        require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
-    typed["agents"] = merge({chosen[0]: of_only}, typed["agents"])
-    return layers | {"typed": typed}
+    return LearnConfig.of_words(overrides)
 
 
 def default_agent(env: Tree, imports: Collection[str]) -> str:
@@ -336,7 +341,7 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     default, the layer that sets it stands beside it.
     """
     overrides = compose.expand(overrides)[0]  # the first run of a sweep
-    layers, choices = layers_of(command, overrides), ("agent", *command.groups())
+    layers, choices = command.layers_of(overrides), ("agent", *command.groups())
     config = command.of_tree(merge(*layers.values()), compose.plugin_paths(overrides))
     lines = ["Choices (group=choice):"]
     for group in choices:

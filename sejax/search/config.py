@@ -12,8 +12,7 @@ from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
 from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
 from sejax.runs import compose
-from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig, layers_of
+from sejax.runs.config import LearnConfig
 from sejax.search import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
@@ -89,7 +88,7 @@ class StudyPlan:
           ConfigError: if it cannot run.
         """
         length = f"generations={self.config.max_generations}", "checkpoint_every=1"
-        return configuration.config([*self.fixed, *overrides, *length])
+        return LearnConfig.of_words([*self.fixed, *overrides, *length])
 
     @cached_property
     def default(self) -> LearnConfig:
@@ -144,7 +143,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     if preset is not None:
         by_key = default.agents.items()
         agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
-        typed = default.named(layers_of(LearnConfig, fixed)["typed"])
+        typed = default.named(LearnConfig.layers_of(fixed)["typed"])
         for name, dimension in spaces.preset(preset, agents).items():
             if name not in typed:
                 space.setdefault(name, dimension)

@@ -27,7 +27,7 @@ from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.options.plain import parsed
 from sejax.runs import session
 from sejax.runs.chunks import make_chunks
-from sejax.runs.config import LearnConfig, layers_of
+from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.runtime import platform_error
 from sejax.runs.store import Store
@@ -292,7 +292,7 @@ def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
     # A preset file of a run names its folder, which holds that run.
     words = [*search.fixed, *overrides, *["run_dir=null"] * bool(search.default.run_dir)]
     line = shlex.join(["python", "-m", "sejax.run", *words])
-    read = search.default.named(layers_of(LearnConfig, words)["typed"])
+    read = search.default.named(LearnConfig.layers_of(words)["typed"])
     settings = {name: parsed(x) if isinstance(x, str) else x for name, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
     write_text(search.folder / "best.txt", f"{line}\n")
