@@ -179,7 +179,7 @@ def stock_students(
         stock_agents = importlib.import_module("stock_agents")
     except ImportError as error:
         fix = "Type pip install 'sejax[bench]', or set students=[sejax_default,sejax_varied]."
-        raise ConfigError.of("students", "must be installed", got=error, fix=fix) from error
+        raise ConfigError("students", "must be installed", got=error, fix=fix) from error
     fingerprint = sejax.load_proxy(source).fingerprint
     seeds = range(settings.seed, settings.seed + GROUP * settings.num_groups)
     for seed, kind in itertools.product(seeds, STOCK[task.num_actions is not None]):

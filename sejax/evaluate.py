@@ -308,7 +308,7 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
 def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
     """The results of fresh agents in a world: arrays `[agent]` by column of the table."""
     env, env_params, task, trainings, is_varied = world
-    agent = agents.make_agent(config.agents[key], task, config.exploration, is_varied)
+    agent = config.agent_for(key, task, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     how = trainings[key], keys, config.num_parallel, config.devices
     outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))

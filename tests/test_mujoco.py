@@ -278,7 +278,7 @@ def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
     monkeypatch.setattr(library, "_load", library._load.__wrapped__)  # as if never loaded
     without(monkeypatch)
     error = refusal(config.make)
-    assert error.field == "env" and str(error).startswith(f"env={config.name} ")
+    assert error.field == "env" and str(error).startswith(f"env cannot be {config.name}, which ")
     assert ("env.backend=mjx" in str(error)) == (config.name == "halfcheetah")
     assert unloadable_library is without or not list(tmp_path.iterdir())
 

@@ -325,7 +325,7 @@ def test_what_runs_its_task_needs_it(tmp_path, config):
 
 
 def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
-    without = MagicMock(side_effect=ConfigError("env=halfcheetah needs MuJoCo."))
+    without = MagicMock(side_effect=ConfigError("env", "needs MuJoCo."))
     monkeypatch.setattr("sejax.envs.make_from", without)
     env, params = sejax.load("halfcheetah")
     _, (obs, reward) = rollout(env, params, jax.random.key(0), num_steps=1)

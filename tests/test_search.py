@@ -42,7 +42,7 @@ class Learning:
 
     def __call__(self, config, folder, seeds):
         if self.refusal:
-            raise ConfigError(self.refusal)
+            raise ConfigError("", self.refusal)
 
         def run(generations):
             folder.mkdir(parents=True, exist_ok=True)

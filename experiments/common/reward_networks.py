@@ -260,7 +260,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     if differing:
         got = f"{path} with another {listed(differing)}"
         must = f"must be a new folder or hold RNs of the same settings; got {got}"
-        raise ConfigError.of("rns_dir", must, use="DIR, or these settings")
+        raise ConfigError("rns_dir", must, use="DIR, or these settings")
     return there
 
 

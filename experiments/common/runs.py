@@ -186,4 +186,4 @@ def read_costs(path: Path, generations: int) -> np.ndarray:
         return np.array([])
     except ValueError as error:
         must = f"must hold whole files; {path} is damaged"
-        raise ConfigError.of("work", must, use="DIR") from error
+        raise ConfigError("work", must, use="DIR") from error

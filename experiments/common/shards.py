@@ -86,7 +86,7 @@ class Shards:
             return None
         if differing:
             must = "must be a new folder or that of the same experiment"
-            raise ConfigError.of("work", f"{must}; {path} differs in {differing}", use="DIR")
+            raise ConfigError("work", f"{must}; {path} differs in {differing}", use="DIR")
         return table
 
 
@@ -109,11 +109,11 @@ def read_rows(path: Path) -> pd.DataFrame:
         rows = pd.read_csv(path, low_memory=False)  # a column has one type throughout
     except FileNotFoundError as error:
         needs = f"needs stored rows; there is no {path}"
-        raise ConfigError.of("from_rows", needs, use="false, or out=DIR") from error
+        raise ConfigError("from_rows", needs, use="false, or out=DIR") from error
     except DAMAGE as error:
         damage = f"{path} is damaged ({' '.join(str(error).split())[:80]})"
         fix = "Restore the file, or set from_rows=false to make it again."
-        raise ConfigError.of("from_rows", f"needs whole rows; {damage}", fix=fix) from error
+        raise ConfigError("from_rows", f"needs whole rows; {damage}", fix=fix) from error
     if _DIFFERENCES in rows:
         rows = rows.assign(**{_DIFFERENCES: rows[_DIFFERENCES].cumsum()})
     return rows.rename(columns={_DIFFERENCES: _GROWING})

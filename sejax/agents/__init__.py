@@ -107,7 +107,7 @@ def require_fit(
     if not _fits(agent, spec):
         known = fitting(spec) or ["MODULE:NAME"]
         must = f"must be one of {', '.join(known)} in {task_name}"
-        raise ConfigError.of(field, must, got=name, use=known[0])
+        raise ConfigError(field, must, got=name, use=known[0])
     is_fit = exploration.states is None or agent.states in (None, exploration.states)
     got = registry.name_of("exploration", exploration)
     require(is_fit, "exploration", f"must be for {agent.states} states", got=got, use="none")

@@ -51,7 +51,7 @@ class OffPolicyOptions(AgentOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         most, got = self.buffer_size, self.batch_size
-        require(got <= most, "agent.batch_size", "must fit agent.buffer_size", got=got, use=most)
+        require(got <= most, "agent.batch_size", "must fit buffer_size", got=got, use=most)
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""

@@ -98,7 +98,7 @@ def _checked(act: Actor, task: Task) -> Actor:
             actions = np.asarray(act(obs), float)
         except Exception as error:
             fault = f"must act in {task.name}; it raised {options.told(error)}."
-            raise options.ConfigError.of("policy", fault) from error
+            raise options.ConfigError("policy", fault) from error
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
         got = f"{list(actions.shape)}, such as {actions.ravel()[:3]}"
         is_fit = actions.shape == shape and known.all()
@@ -117,7 +117,7 @@ def _of_sb3(text: str, task: Task) -> Actor:
     except Exception as error:  # of any kind: the file, the algorithm or the library
         got = f"{shortened(text)} ({options.told(error)}). It needs pip install '.[sb3]'"
         must = f"must be a model that its algorithm saved; got {got}"
-        raise options.ConfigError.of("policy", must, fix=FIX) from error
+        raise options.ConfigError("policy", must, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     is_discrete, space = task.num_actions is not None, model.action_space
     is_fit = hasattr(space, "n") == is_discrete

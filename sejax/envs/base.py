@@ -89,7 +89,7 @@ class Task(TaskSpec):
             raise
         except Exception as error:  # whatever an environment raises
             must = f"must be a gymnax 1.x environment; {name} raised {options.told(error)}."
-            raise options.ConfigError.of("env", must) from error
+            raise options.ConfigError("env", must) from error
         known = {"env": vectors, "params": params, "max_steps": max_steps}
         known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(known)

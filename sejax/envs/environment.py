@@ -171,4 +171,4 @@ def _of_gymnax(space: Any, what: str) -> Space:
         low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
         return Box(low, high)
     fix = "Make them one array in a sejax.envs.wrappers.Wrapper."
-    raise ConfigError.of("env", f"must have {what} in a Box or Discrete", got=repr(space), fix=fix)
+    raise ConfigError("env", f"must have {what} in a Box or Discrete", got=repr(space), fix=fix)

@@ -51,7 +51,7 @@ class GymnaxTask(Options):
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
             must = f"must be one that gymnax makes; {gymnax_id} raised {options.told(error)}."
-            raise options.ConfigError.of("env", must) from error
+            raise options.ConfigError("env", must) from error
         usual = SOLVED_REWARD.get(gymnax_id, math.inf)
         solved = usual if self.solved_reward is None else self.solved_reward
         max_steps = self.max_steps or params.max_steps_in_episode

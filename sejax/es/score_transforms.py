@@ -117,7 +117,7 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
                 weights = np.asarray(jax.jit(function)(scores), float)
         except Exception as error:
             message = f"must take scores in jax; {choice} raised {told(error)}."
-            raise ConfigError.of(FIELD, message) from error
+            raise ConfigError(FIELD, message) from error
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
         must, got = f"must give {pop} finite weights for {pop} scores", weights.tolist()
         require(is_fit, FIELD, must, got=got, fix=f"Mend {choice}, or set {FIELD}=rank.")

@@ -36,7 +36,7 @@ def require_writable(field: str, folder: Path) -> None:
             pass
         remove_empty(new_folders)
     except (OSError, ValueError) as error:
-        raise ConfigError.of(field, "must be a writable folder", got=error, use="FOLDER") from error
+        raise ConfigError(field, "must be a writable folder", got=error, use="FOLDER") from error
 
 
 def missing(folder: Path) -> list[Path]:

@@ -37,7 +37,7 @@ from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypedDict, Unpack
+from typing import Annotated, Any, ClassVar, Literal, TypedDict, Unpack
 
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 
@@ -67,19 +67,20 @@ class ConfigError(ValueError):
 
     Attributes:
       field: the field or group at fault, such as `agent.batch_size`; empty if there is none.
+      rule: what the field must be; without details the whole message, to its full stop.
+      details: texts of `Details`.
     """
 
-    def __init__(self, message: str, field: str = ""):
-        super().__init__(message)
-        self.field = field
+    def __init__(self, field: str, rule: str, **details: Unpack[Details]):
+        super().__init__(field, rule)  # by which it is made again in another process
+        self.field, self.rule = field, rule
+        self.details = {name: shortened(x) if name == "got" else x for name, x in details.items()}
 
-    @classmethod
-    def of(cls, field: str, message: str, **details: Unpack[Details]) -> Self:
-        """The error that `require` raises with these arguments."""
-        got = f"; got {shortened(details['got'])}" if "got" in details else ""
-        fix = f"Set {field}={details['use']}." if "use" in details else details.get("fix", "")
-        end = f". {fix}".rstrip() if details else ""
-        return cls(f"{field} {message}{got}{end}", field)
+    def __str__(self) -> str:
+        message, details = f"{self.field} {self.rule}".lstrip(), self.details
+        message += f"; got {details['got']}" if "got" in details else ""
+        fix = f"Set {self.field}={details['use']}." if "use" in details else details.get("fix", "")
+        return f"{message}. {fix}".rstrip() if details else message
 
 
 class FailedError(RuntimeError):
@@ -92,11 +93,9 @@ def errors_of(group: str, where: str) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        if group in ("", where):
-            raise
-        name = re.escape(group)
-        message = re.sub(rf"\b{name}(?=\.\w| must |=)", where, str(error))
-        raise ConfigError(message, re.sub(rf"^{name}(?![\w-])", where, error.field)) from None
+        if error.field.partition(".")[0] == group:
+            error.field = where + error.field.removeprefix(group)
+        raise
 
 
 def require(holds: object, field: str, message: str, **details: Unpack[Details]) -> None:
@@ -105,7 +104,7 @@ def require(holds: object, field: str, message: str, **details: Unpack[Details])
     Args:
       holds: what must be true.
       field: the field at fault.
-      message: the rule; without details the whole message, to its full stop.
+      message: see `ConfigError.rule`.
       **details: `got`, the value; and `use`, a value that holds, or `fix`. See `Details`.
 
     Example:
@@ -114,7 +113,7 @@ def require(holds: object, field: str, message: str, **details: Unpack[Details])
       sejax.options.ConfigError: es.population_size must be odd; got 0. Set es.population_size=1.
     """
     if not holds:
-        raise ConfigError.of(field, message, **details)
+        raise ConfigError(field, message, **details)
 
 
 def require_package(field: str, package: str, extra: str) -> None:
@@ -126,8 +125,8 @@ def require_package(field: str, package: str, extra: str) -> None:
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """The error for an unknown choice; it lists known names, nearest first, and an override."""
     ranked = nearest(got, known)
-    message = f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}."
-    return ConfigError(f"{message} Set {field}={ranked[0]}.", field)
+    rule = f"must be one of {listed(ranked)}; got {shortened(got)!r}"
+    return ConfigError(field, rule, use=ranked[0])
 
 
 def nearest(got: str, known: Iterable[str]) -> list[str]:
@@ -253,7 +252,7 @@ def hints_of(cls: type, where: str) -> dict[str, Any]:
     try:
         return typing.get_type_hints(cls, include_extras=True)
     except NameError as error:
-        raise ConfigError.of(where, f"must have fields of known types: {error}.") from error
+        raise ConfigError(where, f"must have fields of known types: {error}.") from error
 
 
 def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
@@ -291,7 +290,7 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         must = "have no fields"
     if must == "be a valid tuple":
         must, use = "be a list in brackets", f"[{shortened(got, 20)}]"
-    raise ConfigError.of(name, f"must {must}", got=repr(got), use=use)
+    raise ConfigError(name, f"must {must}", got=repr(got), use=use)
 
 
 @functools.cache

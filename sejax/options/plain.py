@@ -74,13 +74,16 @@ def plugins(group: str) -> Any:
     return dataclasses.field(default_factory=dict, metadata={"plugin": group})
 
 
-def configure(group: str, values: Any, imports: Collection[str] | None = None) -> Any:
+def configure(
+    group: str, values: Any, imports: Collection[str] | None = None, where: str = ""
+) -> Any:
     """The configuration of a plugin that plain values describe: its `name`, and its fields.
 
     Args:
       group: one of `sejax.options.registry.GROUPS`.
       values: plain values by field name.
       imports: each `module:attribute` that may be imported; None: any.
+      where: its name in messages; by default the group.
 
     Raises:
       ConfigError: for an unknown name or field, or a bad value.
@@ -90,16 +93,18 @@ def configure(group: str, values: Any, imports: Collection[str] | None = None) -
       0.9
     """
     is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
-    require(is_choice, group, "must be a choice with its fields", got=values, use="NAME")
-    cls = registry.find(group, values["name"], imports)
+    where = where or group
+    require(is_choice, where, "must be a choice with its fields", got=values, use="NAME")
+    with errors_of(group, where):
+        cls = registry.find(group, values["name"], imports)
     known = fields_of(cls)
     fields = {k: v for k, v in values.items() if k != "name" or k in known}
     for field in [name for name in fields if name not in known]:
         built_in = registry.BUILT_IN[group]
         others = [x for x in built_in if field in fields_of(registry.find(group, x))]
-        message = f"is a field of {group}={', '.join(others)}. Set one of them."
-        require(not others, f"{group}.{field}", message)
-    return from_plain(cls, fields, group, imports)
+        message = f"is a field of {where}={', '.join(others)}. Set one of them."
+        require(not others, f"{where}.{field}", message)
+    return from_plain(cls, fields, where, imports)
 
 
 def from_plain(
@@ -151,7 +156,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
     is_no = "is no field any more" if last in old.GONE else "is no field"
-    return ConfigError.of(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
+    return ConfigError(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
 class _Field(typing.NamedTuple):
@@ -168,13 +173,14 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
         names = {key: f"{field.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
+        if field.group and len(names) == 1:  # an only agent's fields are `agent.FIELD`
+            names = dict.fromkeys(names, field.group)
         fields = {key: field._replace(name=x, default=MISSING) for key, x in names.items()}
         return {str(key): _read(value[key], of_key, one) for key, one in fields.items()}
     if field.group:
         if isinstance(value, Mapping) and field.default is not MISSING:
             value = {"name": registry.name_of(field.group, field.default), **value}
-        with errors_of(field.group, field.name):
-            return configure(field.group, value, field.imports)
+        return configure(field.group, value, field.imports, field.name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
         must = f"must have fields, as {field.name}.{next(iter(fields_of(hint)), 'name')}"
         require(isinstance(value, Mapping), field.name, must, got=repr(value), fix="Leave it out.")

@@ -316,7 +316,7 @@ def imported(field: str, path: str) -> Any:
         is_lost = isinstance(error, ModuleNotFoundError) and not place_of(error)
         must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}."
         must += " Is its folder in PYTHONPATH?" * is_lost
-        raise ConfigError.of(field, must) from error
+        raise ConfigError(field, must) from error
 
 
 @functools.cache

@@ -73,7 +73,7 @@ class ProxyConfig(Options, ABC):
         """Error for a field with one allowed value; in the message `why` follows that value."""
         only, got = as_text(value), as_text(getattr(self, name))
         must = f"must be {only} {shortened(why, 120)}"
-        return ConfigError.of(f"{self.group}.{name}", must, got=got, use=only)
+        return ConfigError(f"{self.group}.{name}", must, got=got, use=only)
 
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":

@@ -132,7 +132,7 @@ def configured(group: str, values: object, where: str) -> Any:
     must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
     text = shortened(name, 80) if ":" in str(name) else "MODULE:NAME"
     fix = f"If you trust it, set {word}={text} in a command, or {field}=... in Python."
-    raise ConfigError.of(field, must, got=shortened(name, 40), fix=fix)
+    raise ConfigError(field, must, got=shortened(name, 40), fix=fix)
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def find(source: str | Path, option: str = "source") -> Path:
         return PRETRAINED_DIR / f"{name}.safetensors"
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
         must = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
-        raise ConfigError.of(option, f"{must}; got {shortened(name)}, where there is none.")
+        raise ConfigError(option, f"{must}; got {shortened(name)}, where there is none.")
     raise unknown_name(option, name, pretrained_names())
 
 
@@ -193,7 +193,7 @@ def read(
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, AttributeError, ValueError, TypeError, ArithmeticError) as error:
         must = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
-        raise ConfigError.of(option, must) from error
+        raise ConfigError(option, must) from error
     is_kind, got = not kinds or header.kind in kinds, f"{shortened(header.kind, 20)} in {where}"
     require(is_kind, option, f"must have proxy={' or '.join(map(str, kinds))}", got=got)
     is_one = len(header.proxies) == 1 or not single

@@ -43,7 +43,7 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
     match = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
     if match is None:
-        raise ConfigError.of(option, must, got=repr(address))
+        raise ConfigError(option, must, got=repr(address))
     repo, revision, file = match.groups()
     return repo, revision, file or FILE
 
@@ -81,4 +81,4 @@ def explained(option: str, address: str) -> Iterator[None]:
         got = f"{shortened(address, 60)}: {shortened(told(error), 90)}"
         must = f"must be within reach on the Hub; got {got}"
         fix = "Check the name and the network, or log in: hf auth login."
-        raise ConfigError.of(option, must, fix=fix) from error
+        raise ConfigError(option, must, fix=fix) from error

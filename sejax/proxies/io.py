@@ -172,7 +172,7 @@ def _stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[s
     if isinstance(proxy, ProxyEnv) and proxy.learned_config is not None:
         return proxy, proxy.learned_config
     fix = "Set env, params = sejax.load(source)."
-    raise ConfigError.of("proxy", "must be a stored one", got=type(proxy).__name__, fix=fix)
+    raise ConfigError("proxy", "must be a stored one", got=type(proxy).__name__, fix=fix)
 
 
 def agent_of(proxy: ProxyEnv | Proxy | ProxySet, name: str | None = None) -> Agent:
@@ -303,7 +303,7 @@ def save_set(
         stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
     except (ValueError, TypeError) as error:
         must = "must be numbers, of the same names and shapes for each proxy"
-        raise ConfigError.of("weights", must, got=told(error), use="params.weights") from error
+        raise ConfigError("weights", must, got=told(error), use="params.weights") from error
     tensors = flatten_dict(stacked, sep="/")
     _require_weights("weights", tensors, env, len(records), "params.weights")
     if not is_set:
@@ -329,7 +329,7 @@ def save_set(
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         must = "must be plain values that sejax.load takes, with numbers for score and seed"
         use = "sejax.config(...).plain()"
-        raise ConfigError.of("config", f"and record {must}", got=told(error), use=use) from error
+        raise ConfigError("config", f"and record {must}", got=told(error), use=use) from error
     write_bytes(Path(path).expanduser(), data)
 
 
@@ -477,7 +477,7 @@ class AbsentEnv(Environment):
         self._reason = reason
 
     def reset_env(self, *_: Any, **__: Any) -> NoReturn:
-        raise ConfigError(self._reason, "task")
+        raise ConfigError("task", f"cannot run here: {self._reason}")
 
     step_env = reset_env
 

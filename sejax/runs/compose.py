@@ -66,8 +66,8 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
             field = shortened(name.strip("- ") or "NAME")
             is_field = name.startswith("-") or name in registry.GROUPS
             fix = f"{field}={text or 'VALUE'}" if is_field else f"env={field} or proxy={field}"
-            message = f"must read FIELD=VALUE; got {shortened(override)}. Write {shortened(fix)}."
-            raise ConfigError(f"an override {message}", "an override")
+            fix = f"Write {shortened(fix)}."
+            raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
         fix = shortened(f"{text.rstrip(',')}]" if is_open else first)
@@ -119,7 +119,7 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
         raise
     except UNREADABLE as error:
         must = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
-        raise ConfigError.of("preset", must, use="best") from error
+        raise ConfigError("preset", must, use="best") from error
 
 
 def _without_replaced(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from sejax import agents, envs
-from sejax.agents.base import AgentConfig, ExplorationConfig
+from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
@@ -34,6 +34,7 @@ from sejax.options import (
 )
 from sejax.options.plain import (
     configure,
+    fields_of,
     flatten,
     from_plain,
     merge,
@@ -107,13 +108,16 @@ class CommandConfig(Options, ABC):
     @classmethod
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
-        typed = compose.tree_of(overrides, cls.groups())
-        layers = cls.layers_below(typed, compose.plugin_paths(overrides))
-        of_only, chosen = typed.pop("agent", {}), [*merge(*layers.values())["agents"]]
+        typed, imports = compose.tree_of(overrides, cls.groups()), compose.plugin_paths(overrides)
+        layers = cls.layers_below(typed, imports)
+        of_only = typed.pop("agent", {})
+        chosen = compose.names_of(merge(*layers.values())["agents"])
         for name, value in flatten(of_only).items():
-            fix = f"Set agents.{chosen[0]}.{name}={shortened(value)}."
+            classes = {key: registry.find("agent", x, imports) for key, x in chosen.items()}
+            known = [key for key, x in classes.items() if name.split(".")[0] in fields_of(x)]
+            fix = f"Set agents.{(known or [*chosen])[0]}.{name}={shortened(value)}."
             require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
-        typed["agents"] = merge({chosen[0]: of_only}, typed["agents"])
+        typed["agents"] = merge({next(iter(chosen)): of_only}, typed["agents"])
         return layers | {"typed": typed}
 
     @classmethod
@@ -127,9 +131,7 @@ class CommandConfig(Options, ABC):
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
-        first, *others = by_key
-        with errors_of("" if others else f"agents.{shortened(first, 40)}", "agent"):
-            config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
+        config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
         for name in [name for name in tree if name not in known]:
             raise unknown_field(str(name), config.named(config.plain()))
         return config
@@ -143,6 +145,11 @@ class CommandConfig(Options, ABC):
     def field_of(self, key: str) -> str:
         """The group of an agent's fields in words: `agent`, or `agents.KEY` of several."""
         return f"agents.{key}" if len(self.agents) > 1 else "agent"
+
+    def agent_for(self, key: str, task: envs.Task, is_varied: bool) -> Agent:
+        """The agent of a key, with the exploration, for a task; see `sejax.make_agent`."""
+        with errors_of("agent", self.field_of(key)):
+            return agents.make_agent(self.agents[key], task, self.exploration, is_varied)
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; `sejax.save` keeps them with a proxy."""
@@ -235,6 +242,7 @@ class LearnConfig(CommandConfig):
         require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
+        require(self.agents, "agents", "must have at least one", use="[ddqn]")
         is_alone, given = len(self.agents) == 1, self.mixture.weights
         is_idle = is_alone and self.mixture != MixtureConfig()
         require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
@@ -261,8 +269,8 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The objects that the configuration describes: the arguments of `sejax.make_learner`."""
-        task, how_made = self.task(), (self.exploration, self.agent_hparams == "varied")
-        learners = tuple(agents.make_agent(x, task, *how_made) for x in self.agents.values())
+        task, is_varied = self.task(), self.agent_hparams == "varied"
+        learners = tuple(self.agent_for(key, task, is_varied) for key in self.agents)
         mixture = Mixture(
             agents=learners,
             names=tuple(self.agents),

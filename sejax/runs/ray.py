@@ -93,7 +93,7 @@ class RayConfig(Options):
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
             must = f"must be within reach; got {self.address} ({told(error)})"
-            raise ConfigError.of("machines.address", must, use="local") from error
+            raise ConfigError("machines.address", must, use="local") from error
         try:
             yield functools.partial(_on_cluster, self)
         finally:
@@ -281,7 +281,7 @@ def call(versions: dict[str, str], function: Callable[..., Any], item: tuple[Any
     _use_one_core()
     if (here := runtime.versions()) != versions:
         got = f"{here} on {socket.gethostname()} and {versions} here"
-        raise ConfigError.of("machines", f"must have the same versions everywhere; got {got}.")
+        raise ConfigError("machines", f"must have the same versions everywhere; got {got}.")
     runtime.configure_jax()
     return function(*item)
 

@@ -166,4 +166,4 @@ class Store:
 
     def refused(self, message: str) -> ConfigError:
         """The error for a folder that cannot be used; the message follows its field."""
-        return ConfigError(f"{self._field} {message}. Set {self._field}=FOLDER.", self._field)
+        return ConfigError(self._field, message, use="FOLDER")

@@ -37,7 +37,7 @@ def main(overrides: Sequence[str]) -> None:
     except study.UNUSABLE as error:
         got = f"{search.folder / 'study.db'} ({told(error.__cause__ or error)})"
         must = f"must hold a database that can be used; got {got}"
-        raise ConfigError.of("search_dir", must, use="FOLDER") from error
+        raise ConfigError("search_dir", must, use="FOLDER") from error
     except KeyboardInterrupt as stop:
         saved = f"What has ended is saved in {search.folder}; the same command resumes from there."
         commands.interrupted(f"Interrupted. {saved}", stop)

@@ -96,7 +96,7 @@ def parse(name: str, text: str) -> Dimension:
         distribution = _distribution(call, tags)
     except (LookupError, TypeError, ValueError, ZeroDivisionError) as error:  # also of Optuna
         must = f"must be a choice, a range or an interval; got {shortened(text)} ({told(error)})"
-        raise ConfigError.of(name, must, use=f"'{EXAMPLE}'") from error
+        raise ConfigError(name, must, use=f"'{EXAMPLE}'") from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
 
 
@@ -149,7 +149,7 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
         known = nearest(name, (file.stem for file in FOLDER.glob("*.yaml")))
         must = f"must be one of {', '.join(known)}, or a YAML file of ranges"
         got = f"{shortened(name)} ({told(error)[:120]})"
-        raise ConfigError.of("space", f"{must}; got {got}", use="paper_se") from error
+        raise ConfigError("space", f"{must}; got {got}", use="paper_se") from error
     foreign = [text for text in texts.values() if ":" in str(text)]
     fix = "Type this range on the command line."
     require(not foreign, "space", "must name no module", got=", ".join(foreign), fix=fix)

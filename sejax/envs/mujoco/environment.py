@@ -73,7 +73,8 @@ class MujocoTask(Options):
             why = str(error)
             if isinstance(error, ImportError):
                 why = f"needs the extra; {error}. Type pip install '.[mujoco]'"
-            raise ConfigError(f"env={self.name} {why}{self.otherwise}.", "env") from error
+            must = f"cannot be {self.name}, which {why}{self.otherwise}."
+            raise ConfigError("env", must) from error
         return Task.of(self.spec, name=self.name, env=MujocoEnv(self))
 
     @property

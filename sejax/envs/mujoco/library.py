@@ -36,7 +36,7 @@ def load() -> ctypes.CDLL:
         message says what helps.
     """
     if (backend := jax.default_backend()) != "cpu":
-        raise ConfigError(f"must run on the CPU; got {backend}. Set JAX_PLATFORMS=cpu")
+        raise ConfigError("", f"must run on the CPU; got {backend}. Set JAX_PLATFORMS=cpu")
     with _LOADING:  # XLA takes only one library in a process
         return _load()
 
@@ -59,7 +59,7 @@ def _load() -> ctypes.CDLL:
             return _register(built)
         except OSError as error:
             fix = "Set SEJAX_CACHE_DIR, or TMPDIR, to a folder that programs can be run from"
-            raise ConfigError(f"cannot load its library ({told(error)}). {fix}") from error
+            raise ConfigError("", f"cannot load its library ({told(error)}). {fix}") from error
 
 
 def file_name() -> str:
@@ -89,7 +89,7 @@ def build(path: Path) -> None:
     except (OSError, subprocess.CalledProcessError) as error:
         said = shortened(error if isinstance(error, OSError) else error.stderr.strip(), 120)
         message = f"needs a C++ compiler; {command[0]} failed with: {said}. Mend that, or set CXX"
-        raise ConfigError(message) from error
+        raise ConfigError("", message) from error
 
 
 def compiler() -> list[str]:

@@ -91,7 +91,7 @@ class HalfCheetah(MujocoTask):
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
             needs = f"needs brax ({error}). Run pip install '.[brax]'."
-            raise ConfigError.of("env.backend", needs) from error
+            raise ConfigError("env.backend", needs) from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
