@@ -28,7 +28,7 @@ import common
 
 import sejax
 from sejax.options.plain import configure
-from sejax.proxies.synthetic import SyntheticConfig
+from sejax.proxies import ProxyConfig
 from sejax.training import TrainingConfig
 
 WARM_UP_STEPS = 300
@@ -50,12 +50,13 @@ class Family:
     in_torch: bool = False
     settings: str = "paper"
 
-    def parts(self, steps: int) -> tuple[Any, SyntheticConfig, TrainingConfig]:
+    def parts(self, steps: int) -> tuple[Any, ProxyConfig, TrainingConfig]:
         """Configurations of agent and SE, and a training of `steps` in which the agent learns.
 
         PPO trains for whole learning phases, at least two of them.
         """
-        proxy = SyntheticConfig(initial_state="real", horizon=None, done="soft")  # the paper's
+        of_paper = {"initial_state": "real", "horizon": None, "done": "soft"}
+        proxy = configure("proxy", {"name": "se", **of_paper})
         if self.settings == "best" or self.agent == "ddqn":
             names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
             chosen = sejax.config(names)

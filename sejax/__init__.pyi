@@ -24,7 +24,7 @@ from .agents.td3 import DiscreteTD3Config as DiscreteTD3Config, TD3Config as TD3
 from .bilevel import LearnResult as LearnResult, make_learner as make_learner
 from .check import check as check
 from .envs.base import Task as Task
-from .es.base import Evaluations as Evaluations, Strategy as Strategy
+from .es.base import Strategy as Strategy
 from .es.evosax import EvosaxConfig as EvosaxConfig
 from .es.nes import NESConfig as NESConfig
 from .evaluation import evaluate_agents as evaluate_agents, make_evaluator as make_evaluator

@@ -117,14 +117,13 @@ class Bilevel:
         """The population around the incumbent, and a key for each of their trainings."""
         key = jax.random.fold_in(state.key, state.generation)
         key_ask, key_inner, key_tell = jax.random.split(key, 3)
-        mixture, objective = self.scoring.mixture, self.scoring.objective
         population, es_state = self.strategy.ask(key_ask, state.es_state)
         return Candidates(
             population=population,
             incumbent=self.strategy.incumbent(es_state),
-            keys=self.scoring.evaluations.keys(key_inner, len(population), mixture.size),
+            keys=self.scoring.keys(key_inner),
             active=~state.solved,
-            test_params=objective.test_params(state.generation),
+            test_params=self.scoring.objective.test_params(state.generation),
             key_tell=key_tell,
             es_state=es_state,
         )
@@ -248,7 +247,7 @@ def make_bilevel(
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, mean.size)
     _require_population(strategy, mean)
-    scoring = Scoring.of(objective, strategy, Mixture.of(agent))
+    scoring = Scoring(objective=objective, strategy=strategy, mixture=Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,
         strategy=strategy,
@@ -267,5 +266,7 @@ def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None
     asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
     shape = (strategy.population_size, mean.size)
     require(asked.shape == shape, "es", f"must ask for candidates {shape}", got=asked.shape)
+    least = min(strategy.num_evals, strategy.num_incumbent_evals)
+    require(least >= 1, "es", "must evaluate each candidate and the incumbent", got=least)
     is_paired = not strategy.antithetic or shape[0] % 2 == 0
     require(is_paired, "es", "must be even, as it is antithetic", got=shape[0])

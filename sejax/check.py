@@ -47,7 +47,7 @@ from sejax.proxies.io import Proxy
 from sejax.runs import commands, compose, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.chunks import Pool
-from sejax.runs.config import REAL_TRAINING
+from sejax.runs.config import REAL_TRAINING, MachinesConfig
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
@@ -77,7 +77,7 @@ class CheckConfig(EvaluateConfig):
         that follows if the search does not solve the task
     """
 
-    machines: Any = plugin("machines")
+    machines: MachinesConfig = plugin("machines")
     algorithms: tuple[str, ...] | None = None
     null_steps: Count = 200_000
     num_agents: Annotated[int, Field(ge=ENOUGH, le=LARGEST)] = 20
@@ -170,7 +170,6 @@ def _judgeable(config: CheckConfig) -> Proxy:
     have_one = all(hasattr(agent, "discount") for agent in config.agents.values())
     require(have_one, "agent", "must have a discount", got=", ".join(config.agents), use="NAME")
     zoo.describe(header.read(proxy.path))  # raises if a record of its file cannot be printed
-    require(hasattr(config.machines, "pool"), "machines", "must have a pool", use="local")
     return proxy
 
 

@@ -109,7 +109,7 @@ class GenerationEvaluator:
         """The trainings of each agent: on its candidates, and then on the incumbent."""
         shared, by_agent = (candidates.active, candidates.test_params), []
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
-        num_evals = self._scoring.evaluations.num_evals
+        num_evals = self._scoring.strategy.num_evals
         for agent_index, size in enumerate(self.num_trainings):
             numbers = self._scoring.trainings_of(agent_index)
             rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last

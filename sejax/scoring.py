@@ -6,17 +6,17 @@ one for each training. A mixture puts the first ones in one unit. An objective m
 another score (`Objective.shown`), as `MaxReward.first_eval_steps` does.
 """
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Shaped
 
 from sejax.agents.mixture import Mixture
-from sejax.es.base import Evaluations, Strategy
+from sejax.es.base import Strategy
 from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
 
@@ -87,32 +87,27 @@ class Scoring:
 
     Attributes:
       objective: the score of one outcome.
+      strategy: how many candidates a generation has, and how often each is evaluated.
       mixture: the agents.
-      candidates_of: for each agent, the numbers of the candidates that it trains on.
-      evaluations: how often each candidate is evaluated; each agent evaluates the incumbent equally
-        often.
     """
 
     objective: Objective
+    strategy: Strategy
     mixture: Mixture
-    candidates_of: tuple[np.ndarray, ...]
-    evaluations: Evaluations
 
-    @classmethod
-    def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
-        """The scoring of a strategy's population.
+    @property
+    def num_incumbent_evals(self) -> int:
+        """Trainings on the incumbent, rounded up to equally many with each agent."""
+        return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
+
+    @property
+    def candidates_of(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the numbers of the candidates that it trains on.
 
         Raises:
           ConfigError: if the population is too small for the mixture.
         """
-        # Rounded up to equally many with each agent.
-        num_evals = -(-strategy.evaluations.num_incumbent_evals // mixture.size) * mixture.size
-        return cls(
-            objective=objective,
-            mixture=mixture,
-            candidates_of=mixture.deal(strategy.population_size, strategy.antithetic),
-            evaluations=dataclasses.replace(strategy.evaluations, num_incumbent_evals=num_evals),
-        )
+        return self.mixture.deal(self.strategy.population_size, self.strategy.antithetic)
 
     @property
     def agent_of(self) -> np.ndarray:
@@ -120,13 +115,25 @@ class Scoring:
         of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
         for agent_index, numbers in enumerate(self.candidates_of):
             of_candidate[numbers] = agent_index
-        of_population = np.repeat(of_candidate, self.evaluations.num_evals)
-        of_incumbent = np.arange(self.evaluations.num_incumbent_evals) % self.mixture.size
+        of_population = np.repeat(of_candidate, self.strategy.num_evals)
+        of_incumbent = np.arange(self.num_incumbent_evals) % self.mixture.size
         return np.concatenate([of_population, of_incumbent])
 
     def trainings_of(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all trainings of a generation."""
         return np.flatnonzero(self.agent_of == agent_index)
+
+    def keys(self, key: Array) -> Array:
+        """A key for each training of a generation, `[training]`, from the generation's key."""
+        of_population = np.arange(self.strategy.population_size * self.strategy.num_evals)
+        of_incumbent = np.arange(self.num_incumbent_evals)
+        if self.strategy.common_random_numbers:
+            of_population = of_population % self.strategy.num_evals
+            of_incumbent = of_incumbent // self.mixture.size
+        else:
+            of_incumbent = of_incumbent + of_population.size
+        numbers = np.concatenate([of_population, of_incumbent])
+        return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
@@ -135,8 +142,9 @@ class Scoring:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
         scores = self._scores(self.objective(outcome))
-        by_candidate = scores.population.reshape(-1, self.evaluations.num_evals)
-        population = self.evaluations.candidate_scores(by_candidate)
+        by_candidate = scores.population.reshape(-1, self.strategy.num_evals)
+        aggregate = jnp.mean if self.strategy.eval_aggregate == "mean" else jnp.min
+        population = aggregate(by_candidate, axis=1)  # nan if the agent of one diverged
         return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
 
     def for_people(self, outcome: Outcome) -> Scores:
@@ -171,13 +179,13 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        means, num_in_population = [], scores.size - self.evaluations.num_incumbent_evals
+        means, num_in_population = [], scores.size - self.num_incumbent_evals
         population, incumbent = jnp.split(scores, [num_in_population])
         for agent_index in range(self.mixture.size):
             numbers = self.trainings_of(agent_index)
             on_incumbent = numbers[numbers >= num_in_population] - num_in_population
             of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
-            repaired, mean = self.evaluations.with_diverged_last(*of_agent)
+            repaired, mean = with_diverged_last(*of_agent)
             incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
@@ -196,3 +204,17 @@ class Scoring:
         """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
         by_agent = map(self.trainings_of, range(self.mixture.size))
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
+
+
+def with_diverged_last(
+    scores: Float[Array, " turn"], population: Float[Array, " evaluation"]
+) -> tuple[Float[Array, " turn"], Float[Array, ""]]:
+    """The incumbent's scores with one agent, diverged ones ranked last, and their mean.
+
+    Agents that diverged have the score nan. They get the lowest score of their algorithm in the
+    generation: a mean without them would rank an incumbent by its other agents alone. If all
+    diverged, the mean is nan.
+    """
+    lowest, diverged = jnp.nanmin(jnp.concatenate([population, scores])), jnp.isnan(scores)
+    repaired = jnp.where(diverged & ~diverged.all(), lowest, scores)
+    return repaired, finite_mean(repaired)

@@ -11,11 +11,13 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 from sejax.evaluate import EvaluateConfig
+from sejax.objectives import Outcome
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError
 from sejax.proxies.synthetic import SyntheticConfig
@@ -226,6 +228,16 @@ def ended(monkeypatch, capsys, command, *words):
 def has_compiler():
     """Whether MuJoCo's library can be built here."""
     return shutil.which((os.environ.get("CXX") or "c++").split()[0]) is not None
+
+
+def outcome_of(returns):
+    """The outcome of agents with these test returns; nan for those that diverged."""
+    returns = jnp.float32(returns)
+    counts = jnp.ones(returns.shape, jnp.int32)
+    return Outcome(
+        test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
+        train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
+    )  # fmt: skip
 
 
 def evaluation(words):

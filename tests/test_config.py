@@ -229,8 +229,10 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agent=no_module_of:mine", "agent", "PYTHONPATH"), (f"agent=a:{'d' * 5000}", "agent", ""),
     ("agents=[ddqn,td3_discret]", "agents.td3_discret", "td3_discrete"),
     ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
+    ("agents=[ddqn,ppo] agent.clip_ratio=1", "agent.clip_ratio", "agents.ppo.clip_ratio=1"),
+    ("agents=[ddqn,ppo] agents.ppo.tau=1", "agents.ppo.tau", "of agents.ppo=ddqn, "),
     ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
-    ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
+    ("agents=[ddqn,ppo] agents.ppo.epoch=3", "agents.ppo.epoch", "agents.ppo.epochs?"),
     ("mixture.aggregate=min", "mixture", "agents=[ddqn,ppo]"),
     ("preset=paper env=mountain_car", "preset", "preset=best"),
     (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
@@ -255,6 +257,17 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     assert error.field == field and suggested in str(error), error
 
 
+def test_parts_that_only_a_task_can_judge_are_refused_by_their_agents_name():
+    config = sejax.config(["agents=[ddqn,ppo]", "agents.ppo.num_minibatches=100"])
+    error = refusal(config.parts)
+    assert error.field == "agents.ppo.num_minibatches" and f"Set {error.field}=64." in str(error)
+
+
+@pytest.mark.parametrize("part", [{"es": "nes"}, {"machines": 3}, {"proxy": None}, {"agents": {}}])
+def test_a_configuration_made_in_python_holds_configurations(part):
+    assert refusal(dataclasses.replace, sejax.config(), **part).field == next(iter(part))
+
+
 @pytest.mark.parametrize(("override", "field"), [
     ("num_agents=3", "proxy"), ("proxy=real agent_hparams=as_learned", "agent_hparams"),
     ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
@@ -277,12 +290,10 @@ def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
     names = [*LearnConfig.groups(), "preset", "seed", "generations", "devices", "agents"]
     names += [f"{group}.{field}" for group in groups for field in fields]
     texts = "0 1 -1 2.5 1e-3 64 nan inf null true [] [1] [ [ddqn] x ddqn ppo acrobot rn relu paper"
-    texts += " threshold ' ☃ a:b ${x} {a:1} 0x10 1_000 ~ ??? 99999999999999999999"
+    texts = f"{texts} threshold ' ☃ a:b ${{x}} {{a:1}} 0x10 1_000 ~ ??? 9999999999999999999".split()
     composed = 0
     for _ in range(400):
-        overrides = [
-            f"{rng.choice(names)}={rng.choice(texts.split())}" for _ in range(rng.randint(1, 2))
-        ]
+        overrides = [f"{rng.choice(names)}={rng.choice(texts)}" for _ in range(rng.randint(1, 2))]
         try:
             config = sejax.config(overrides)
         except ConfigError as error:

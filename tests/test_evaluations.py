@@ -1,4 +1,4 @@
-"""sejax.es.base: how often candidates are evaluated, and how their scores combine."""
+"""sejax.scoring: how often candidates are evaluated, and how their scores combine."""
 
 import dataclasses
 
@@ -6,22 +6,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import outcome_of
 
-from sejax.es.base import Evaluations
+import sejax
+from sejax import envs
+from sejax.agents.mixture import Mixture
 from sejax.es.evosax import EvosaxConfig
 from sejax.es.nes import NESConfig
+from sejax.objectives import MaxReward
 from sejax.ops.scores import finite_mean
+from sejax.scoring import Scoring, with_diverged_last
 
 NAN, INF = np.nan, np.inf
+
+
+def scoring_of(config, num_agents=1):
+    """The scoring of a strategy, with agents that are never run."""
+    task = envs.make("gridworld_2x2")
+    agents = (sejax.make_agent(sejax.QLearningConfig(), task),) * num_agents
+    parts = {"objective": MaxReward().make(task), "mixture": Mixture(agents=agents)}
+    return Scoring(strategy=config.make(6), **parts)
 
 
 @pytest.mark.parametrize("cls", [NESConfig, EvosaxConfig])
 def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
     config = cls(population_size=4, num_evals=2, num_incumbent_evals=3)
     for shared in (False, True):
-        strategy = dataclasses.replace(config, common_random_numbers=shared).make(6)
-        size = strategy.population_size
-        keys = strategy.evaluations.keys(jax.random.key(0), size)
+        scoring = scoring_of(dataclasses.replace(config, common_random_numbers=shared))
+        size, keys = scoring.strategy.population_size, scoring.keys(jax.random.key(0))
         seeds = np.asarray(jax.random.key_data(keys))
         assert len(seeds) == 2 * size + 3
         assert len(np.unique(seeds, axis=0)) == (3 if shared else len(seeds))
@@ -30,21 +42,21 @@ def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
 
 
 def test_with_common_random_numbers_all_agents_of_a_mixture_have_the_populations():
-    evaluations = Evaluations(num_evals=2, num_incumbent_evals=6, common_random_numbers=True)
-    keys = evaluations.keys(jax.random.key(0), 4, num_agents=2)
+    fields = {"num_evals": 2, "num_incumbent_evals": 6, "common_random_numbers": True}
+    keys = scoring_of(NESConfig(population_size=2, **fields), 2).keys(jax.random.key(0))
     assert (keys[8:12] == keys[jnp.array([6, 6, 7, 7])]).all()  # the population's are 0 to 7
 
 
 # --- what is evaluated, and its scores -----------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("aggregate", "expected"), [("mean", [2.0, NAN, NAN, -4.0]), ("min", [1.0, NAN, NAN, -4.0])]
-)
-def test_a_member_has_no_score_if_the_agent_of_one_evaluation_diverged(aggregate, expected):
-    evaluations = Evaluations(num_evals=2, aggregate=aggregate)
-    scores = jnp.array([[1.0, 3.0], [2.0, NAN], [NAN, 0.0], [-4.0, -4.0]])
-    np.testing.assert_array_equal(evaluations.candidate_scores(scores), expected)
+@pytest.mark.parametrize(("aggregate", "first"), [("mean", 2.0), ("min", 1.0)])
+def test_a_member_has_no_score_if_the_agent_of_one_evaluation_diverged(aggregate, first):
+    es = NESConfig(population_size=2, num_evals=2, eval_aggregate=aggregate, num_incumbent_evals=1)
+    scores = jnp.array([1.0, 3.0, 2.0, NAN, NAN, 0.0, -4.0, -4.0, 5.0])
+    told, incumbent = scoring_of(es).for_strategy(outcome_of(scores))
+    np.testing.assert_array_equal(told, [first, NAN, NAN, -4.0])
+    assert incumbent == 5
 
 
 @pytest.mark.parametrize(("scores", "members", "repaired", "mean"), [
@@ -57,7 +69,7 @@ def test_a_member_has_no_score_if_the_agent_of_one_evaluation_diverged(aggregate
     ([NAN, NAN, NAN], [1, 2], [NAN, NAN, NAN], NAN),
 ])  # fmt: skip
 def test_the_incumbents_agents_that_diverged_get_the_lowest_score(scores, members, repaired, mean):
-    result = Evaluations().with_diverged_last(jnp.float32(scores), jnp.float32(members))
+    result = with_diverged_last(jnp.float32(scores), jnp.float32(members))
     np.testing.assert_array_equal(result[0], repaired)
     np.testing.assert_array_equal(result[1], mean)
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_equal, paper_se, refused
+from support import assert_equal, outcome_of, paper_se, refused
 
 import sejax
 from sejax import envs
@@ -14,20 +14,15 @@ from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
-from sejax.objectives import Outcome
 from sejax.options import registry
 from sejax.training import TrainingConfig
 
 NAN, INF = np.nan, np.inf
 KEY = jax.random.key(0)
 TASK = envs.make("gridworld_2x2")
-AGENTS = tuple(
-    sejax.make_agent(config, TASK)
-    for config in (
-        sejax.QLearningConfig(learning_rate=0.5),
-        sejax.SARSAConfig(learning_rate=0.3, epsilon_init=0.7, epsilon_min=0.7),
-    )
-)
+SARSA = sejax.SARSAConfig(learning_rate=0.3, epsilon_init=0.7, epsilon_min=0.7)
+CONFIGS = sejax.QLearningConfig(learning_rate=0.5), SARSA
+AGENTS = tuple(sejax.make_agent(config, TASK) for config in CONFIGS)
 
 
 def mixture(num=2, weights=(), **config):
@@ -60,7 +55,7 @@ def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
 def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
     bilevel = make_bilevel(task=TASK, agent=mixture(num), es=NESConfig(num_incumbent_evals=asked))
-    assert bilevel.scoring.evaluations.num_incumbent_evals == evals
+    assert bilevel.scoring.num_incumbent_evals == evals
 
 
 @pytest.mark.parametrize(("make", "field"), [
@@ -115,16 +110,6 @@ def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing():
     mean = np.float32(-93.3) - np.float32(2e-5)  # as a mean of equal scores may be off
     got, _ = compare([-93.3, 0.0, -93.3, 1.0], [0, 1, 0, 1], [mean, 0.5])
     assert got[0] == got[2] == 0 and got[1] < 0 < got[3]
-
-
-def outcome_of(returns):
-    """The outcome of agents with these test returns; nan for those that diverged."""
-    returns = jnp.float32(returns)
-    counts = jnp.ones(returns.shape, jnp.int32)
-    return Outcome(
-        test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
-        train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
-    )  # fmt: skip
 
 
 # --- Algorithm 1 ---------------------------------------------------------------------------------

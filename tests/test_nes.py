@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support import refused
 
-from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, from_evosax
 from sejax.es.nes import NESConfig
+from sejax.scoring import with_diverged_last
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
@@ -21,8 +21,7 @@ MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
 
 def num_trainings(strategy):
     """Trainings in a generation."""
-    evaluations = strategy.evaluations
-    return strategy.population_size * evaluations.num_evals + evaluations.num_incumbent_evals
+    return strategy.population_size * strategy.num_evals + strategy.num_incumbent_evals
 
 
 def whole_generations(strategy):
@@ -31,18 +30,17 @@ def whole_generations(strategy):
     `ask(key, state) -> (candidates, state)`, `tell(key, candidates, scores, state) -> state`. The
     evaluations of a candidate follow one another; those of the incumbent come last.
     """
-    evaluations = strategy.evaluations
-    num_evals, size = evaluations.num_evals, strategy.population_size
+    num_evals, size = strategy.num_evals, strategy.population_size
 
     def ask(key, state):
         population, state = strategy.ask(key, state)
-        incumbent = jnp.tile(strategy.incumbent(state), (evaluations.num_incumbent_evals, 1))
+        incumbent = jnp.tile(strategy.incumbent(state), (strategy.num_incumbent_evals, 1))
         return jnp.concatenate([jnp.repeat(population, num_evals, axis=0), incumbent]), state
 
     def tell(key, candidates, scores, state):
         of_population, of_incumbent = jnp.split(scores, [size * num_evals])
-        _, incumbent = evaluations.with_diverged_last(of_incumbent, of_population)
-        scores = evaluations.candidate_scores(of_population.reshape(size, num_evals))
+        _, incumbent = with_diverged_last(of_incumbent, of_population)
+        scores = getattr(of_population.reshape(size, num_evals), strategy.eval_aggregate)(axis=1)
         population = candidates[: size * num_evals : num_evals]
         return strategy.tell(key, population, scores, incumbent, state)
 
@@ -134,12 +132,10 @@ def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
 
 
 @pytest.mark.parametrize("update_rule", ["authors", "paper"])
-@pytest.mark.parametrize(
-    ("aggregate_by", "mirrored"), [("mean", True), ("min", True), ("mean", False)]
-)
-def test_generations_equal_a_numpy_loop(update_rule, aggregate_by, mirrored):
+@pytest.mark.parametrize(("by", "mirrored"), [("mean", True), ("min", True), ("mean", False)])
+def test_generations_equal_a_numpy_loop(update_rule, by, mirrored):
     config = NESConfig(
-        population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
+        population_size=4, num_evals=3, eval_aggregate=by, update_rule=update_rule,
         num_incumbent_evals=None, mirrored=mirrored,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
@@ -235,8 +231,7 @@ def another_of_evosax(num_dims):
     algorithm = HillClimbing(
         population_size=16, solution=jnp.zeros(num_dims), std_schedule=lambda generation: 0.1
     )
-    evaluations = Evaluations(num_incumbent_evals=2)
-    return from_evosax(algorithm, evaluations=evaluations)
+    return from_evosax(algorithm, num_incumbent_evals=2)
 
 
 TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)

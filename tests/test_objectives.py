@@ -5,25 +5,21 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import refused
+from support import outcome_of, refused
 
 from sejax import envs
-from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
+from sejax.objectives import AUC, AUCSum, MaxReward, Objective, RewardThreshold
 from sejax.options import registry
 from sejax.options.plain import configure
 
 
 def outcome(test_return, train_steps, nonfinite):
-    returns, ones = jnp.float32(test_return)[:, None], jnp.ones(len(test_return), jnp.int32)
-    return Outcome(
+    returns, steps = jnp.float32(test_return)[:, None], jnp.array(train_steps, jnp.int32)
+    return outcome_of(test_return).replace(
         test_returns=returns + jnp.float32([-1, 0, 1]),  # the mean over three episodes
-        scored_returns=2 * returns + jnp.float32([-1, 1]),
-        train_steps=jnp.array(train_steps, jnp.int32),
-        train_episodes=ones,
-        auc=jnp.arange(len(ones), dtype=jnp.float32),
-        nonfinite=jnp.array(nonfinite),
-        real_steps=ones,
-    )
+        scored_returns=2 * returns + jnp.float32([-1, 1]), train_steps=steps,
+        auc=jnp.arange(len(test_return), dtype=jnp.float32), nonfinite=jnp.array(nonfinite),
+    )  # fmt: skip
 
 
 def task(solved_reward=195.0):

@@ -230,7 +230,8 @@ def copy(task: Task, teacher: Teacher, num_states: int, widen: float) -> Copied:
     noise = jax.random.normal(key_noise, rows.shape)
     is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
     if np.isinf(widen):
-        units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
+        config: Any = sejax.config([f"env={task.name}"]).proxy
+        units = config.units(task.observation)
         states = noise if units is None else units.decode(noise)
     else:
         states = jnp.where(

@@ -7,7 +7,7 @@ Each agent's own file has its networks, its loss and its targets.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree
 
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
-from sejax.ops.networks import MLP
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import apply_gradient
 from sejax.options import Activation, Count, Depth, Fraction, Positive, option, require
 
@@ -88,6 +88,24 @@ class OffPolicy(Algorithm):
 
 class ActorCritic(OffPolicy):
     """An off-policy agent that acts at random while its state's `is_warming_up` is set."""
+
+    obs_dim: int
+    actor: MLP
+    critic: MLP
+
+    def init_networks(self, key: Array, hparams: Hparams, num_actions: int) -> tuple[Any, Any]:
+        """Parameters of the actor, and of two critics, `[2, ...]`.
+
+        Args:
+          key: for both.
+          hparams: with the units in use.
+          num_actions: actions among the critics' inputs.
+        """
+        key_actor, key_critics = jax.random.split(key)
+        num_inputs, size = self.obs_dim + num_actions, hparams.hidden_size
+        init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
+        actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
+        return actor, init_critics(jax.random.split(key_critics))
 
     def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
         return state.replace(is_warming_up=jnp.asarray(episode < self.config.warmup_episodes))

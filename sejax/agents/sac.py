@@ -24,7 +24,6 @@ from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
 from sejax.agents.policies import select_action
 from sejax.envs.base import Task
-from sejax.ops.networks import init_narrowed
 from sejax.ops.optimizers import ADAM
 from sejax.options import Finite, Fraction, NonNegative, Positive, option, require
 
@@ -126,14 +125,8 @@ class SAC(ActorCritic):
         self.critics = jax.vmap(self.critic.apply, (0, None))
 
     def init_params(self, key: Array, hparams: Hparams) -> Params:
-        key_actor, key_critics = jax.random.split(key)
-        num_inputs, size = self.obs_dim + self.action_inputs, hparams.hidden_size
-        init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
-        return Params(
-            actor=init_narrowed(self.actor, key_actor, self.obs_dim, size),
-            critics=init_critics(jax.random.split(key_critics)),
-            log_alpha=jnp.log(jnp.float32(hparams.init_alpha)),
-        )
+        actor, critics = self.init_networks(key, hparams, self.action_inputs)
+        return Params(actor, critics, log_alpha=jnp.log(jnp.float32(hparams.init_alpha)))
 
     def init(self, key: Array, hparams: Hparams) -> SACState:
         params = self.init_params(key, hparams)

@@ -20,7 +20,7 @@ from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
 from sejax.envs.base import Task
-from sejax.ops.networks import MLP, init_narrowed
+from sejax.ops.networks import MLP
 from sejax.ops.optimizers import ADAM
 from sejax.options import Activation, Count, Fraction, NonNegative, Positive, option
 
@@ -136,11 +136,7 @@ class TD3(ActorCritic):
         self.actor, self.critic = config.mlp(action_dim), config.mlp(1)
 
     def init(self, key: Array, hparams: Hparams) -> TD3State:
-        key_actor, key_critics = jax.random.split(key)
-        num_inputs, size = self.obs_dim + self.action_dim, hparams.hidden_size
-        init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
-        critics = init_critics(jax.random.split(key_critics))
-        actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
+        actor, critics = self.init_networks(key, hparams, self.action_dim)
         return TD3State(
             actor=actor,
             critics=critics,

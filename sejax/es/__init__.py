@@ -1,5 +1,5 @@
 """Outer optimisers: the paper's NES and evosax's algorithms behind one small contract."""
 
-from sejax.es.base import Evaluations, Strategy
+from sejax.es.base import Strategy
 
-__all__ = ["Evaluations", "Strategy"]
+__all__ = ["Strategy"]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import Evaluations, NumMembers, Scale, Strategy, StrategyOptions, StrategyState
+from sejax.es.base import NumMembers, Scale, Strategy, StrategyOptions, StrategyState
 from sejax.ops.scores import below_all
 from sejax.options import LEAST, Count, Decay, require, require_known
 
@@ -85,8 +85,8 @@ class EvosaxConfig(StrategyOptions):
         params = algorithm.default_params
         if self.name != "open_es":
             params = params.replace(std_init=self.noise_std)
-        evaluations = self.evaluations(self.num_incumbent_evals)
-        strategy = from_evosax(algorithm, params, antithetic=antithetic, evaluations=evaluations)
+        fields = {"antithetic": antithetic, "num_incumbent_evals": self.num_incumbent_evals}
+        strategy = from_evosax(algorithm, params, **fields, **self.shared())
         if self.name not in ("open_es", "xnes"):
             return strategy
 
@@ -102,9 +102,7 @@ class EvosaxConfig(StrategyOptions):
 def from_evosax(
     algorithm: "DistributionBasedAlgorithm",
     params: "Params | None" = None,
-    *,
-    antithetic: bool = False,
-    evaluations: Evaluations = Evaluations(),
+    **fields: Any,
 ) -> Strategy:
     """A strategy from an algorithm of evosax. The algorithm's mean is the incumbent.
 
@@ -113,8 +111,7 @@ def from_evosax(
     Args:
       algorithm: a distribution-based algorithm for vectors `[num_dims]`.
       params: of the algorithm; its `default_params` if not given.
-      antithetic: whether the second half of its candidates mirrors the first at the mean.
-      evaluations: how often each candidate is evaluated.
+      **fields: further fields of `Strategy`: `antithetic`, and how often candidates are evaluated.
 
     Example:
       >>> from evosax.algorithms import Rm_ES
@@ -144,6 +141,5 @@ def from_evosax(
         tell=tell,
         incumbent=algorithm.get_mean,
         population_size=algorithm.population_size,
-        antithetic=antithetic,
-        evaluations=evaluations,
+        **fields,
     )

@@ -117,7 +117,8 @@ class NESConfig(StrategyOptions):
             incumbent=lambda state: state.mean,
             population_size=2 * num_noises if self.mirrored else num_noises,
             antithetic=self.mirrored,
-            evaluations=self.evaluations(self.num_incumbent_evals or num_noises),
+            num_incumbent_evals=self.num_incumbent_evals or num_noises,
+            **self.shared(),
         )
 
 

@@ -74,7 +74,12 @@ GROUPS = {
     "objective": Group("sejax.objectives", "sejax.objectives:Objective", ("task",)),
     "es": Group("sejax.strategies", "sejax.es.base:Strategy", ("num_dims",)),
     "tracker": Group("sejax.trackers", "sejax.runs.trackers:Tracker", ("run",)),
-    "machines": Group("sejax.machines", "contextlib:AbstractContextManager", ("config",)),
+    "machines": Group(
+        "sejax.machines",
+        "contextlib:AbstractContextManager",
+        ("config",),
+        "sejax.runs.config:MachinesConfig",
+    ),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
 # Names that come with sejax. A group's first name is chosen if nothing else makes a choice.

@@ -2,18 +2,16 @@
 
 import contextlib
 import functools
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.ops.parallel import compiler_options
-from sejax.options import Options
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import LearnConfig, MachinesConfig
 from sejax.scoring import GenerationInfo
 
 Chunk: TypeAlias = Callable[[LearnState], tuple[LearnState, GenerationInfo]]
@@ -64,15 +62,8 @@ def make_chunks(config: LearnConfig) -> Chunks:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocalConfig(Options):
+class LocalConfig(MachinesConfig):
     """This process computes everything: one compiled program over its devices."""
 
-    group: ClassVar[str] = "machines"
-
     def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
-        """The compiled generations of a run."""
         return contextlib.nullcontext(make_chunks(config))
-
-    def pool(self) -> contextlib.AbstractContextManager[Pool]:
-        """Calls a function with each of several tuples of arguments, one after the other."""
-        return contextlib.nullcontext(itertools.starmap)

@@ -8,17 +8,21 @@ themselves.
 
 import contextlib
 import dataclasses
+import itertools
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from sejax import agents, envs
 from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.envs.spec import TaskSpec
+from sejax.es.base import Strategy
+from sejax.objectives import Objective
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -46,7 +50,11 @@ from sejax.options.plain import (
 from sejax.proxies import ProxyConfig
 from sejax.runs import compose
 from sejax.runs.compose import Tree
+from sejax.runs.trackers import Tracker
 from sejax.training import TrainingConfig, require_reachable
+
+if TYPE_CHECKING:  # which imports this module
+    from sejax.runs.chunks import Chunks, Pool
 
 TRAINING = TrainingConfig()  # for proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
@@ -197,6 +205,26 @@ class CommandConfig(Options, ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MachinesConfig(Options, ABC):
+    """Where agents train.
+
+    Attributes:
+      is_elsewhere: whether other processes train them.
+    """
+
+    group: ClassVar[str] = "machines"
+    is_elsewhere: ClassVar[bool] = False
+
+    @abstractmethod
+    def make(self, config: "LearnConfig") -> AbstractContextManager["Chunks"]:
+        """The compiled generations of a run."""
+
+    def pool(self) -> AbstractContextManager["Pool"]:
+        """Calls a function with each of several tuples of arguments, one after the other."""
+        return contextlib.nullcontext(itertools.starmap)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LearnConfig(CommandConfig):
     """A whole bilevel optimisation, as `sejax.run` and `sejax.make_learner` take it.
 
@@ -223,12 +251,12 @@ class LearnConfig(CommandConfig):
 
     mixture: MixtureConfig = MixtureConfig()
     preset: str = "best"
-    env: Any = plugin("env")
-    proxy: Any = plugin("proxy")
-    es: Any = plugin("es")
-    objective: Any = plugin("objective")
-    tracker: Any = plugin("tracker")
-    machines: Any = plugin("machines")
+    env: registry.Makes[envs.Task] = plugin("env")
+    proxy: ProxyConfig = plugin("proxy")
+    es: registry.Makes[Strategy] = plugin("es")
+    objective: registry.Makes[Objective] = plugin("objective")
+    tracker: registry.Makes[Tracker] = plugin("tracker")
+    machines: MachinesConfig = plugin("machines")
     agent_hparams: Literal["default", "varied"] = "default"
     generations: Count = 100
     num_seeds: Count = 1
@@ -238,7 +266,7 @@ class LearnConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_here = self.devices is None or not getattr(self.machines, "is_elsewhere", False)
+        is_here = self.devices is None or not self.machines.is_elsewhere
         require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)

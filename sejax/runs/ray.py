@@ -27,11 +27,11 @@ from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import ConfigError, Count, FailedError, Options, require_package, shortened, told
+from sejax.options import ConfigError, Count, FailedError, require_package, shortened, told
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.chunks import Chunks, Pool
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import LearnConfig, MachinesConfig
 from sejax.scoring import GenerationInfo
 
 WorkShare: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
@@ -41,7 +41,7 @@ LOOK_S = 1.0  # seconds between checks that the cluster still answers
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayConfig(Options):
+class RayConfig(MachinesConfig):
     """Worker processes on a Ray cluster, each on a CPU core.
 
     Attributes:
@@ -49,7 +49,6 @@ class RayConfig(Options):
       workers: worker processes; null: one for each CPU core of the cluster
     """
 
-    group: ClassVar[str] = "machines"
     is_elsewhere: ClassVar[bool] = True
 
     address: str | None = None
