@@ -143,7 +143,7 @@ class Bilevel:
         es_state = self.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        scores = self.scoring.for_people(outcome)
+        scores = self.scoring.shown(outcome)
         score, agent_means = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(

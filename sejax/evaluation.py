@@ -294,7 +294,7 @@ def make_tested_trainer(
     """
     if training.stop_rule == "solved" and not task.is_solvable:  # tests would end no training
         training = dataclasses.replace(training, stop_rule="never")
-    test = make_tester(agent, task, max(1, training.num_tests_between))
+    test = make_tester(agent, task, max(1, training.tests_after_each))
 
     def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:
         tests = test(key, agent_state, active)
@@ -309,7 +309,7 @@ def tested_throughout(training: TrainingConfig) -> TrainingConfig:
     If the learning curve ended there, the area under it would reward late learning.
     """
     stop_rule = "never" if training.stop_rule == "solved" else training.stop_rule
-    tests_between = max(1, training.num_tests_between)
+    tests_between = max(1, training.tests_after_each)
     return dataclasses.replace(training, stop_rule=stop_rule, tests_between=tests_between)
 
 

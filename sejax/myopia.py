@@ -20,17 +20,17 @@ from scipy.special import stdtrit
 MARGIN = 0.1
 LEVEL = 0.95
 ENOUGH = 5  # independent values that an interval needs
-NONE = (math.nan, math.nan)  # the interval of fewer values
+UNKNOWN = (math.nan, math.nan)  # the interval of fewer values
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Student's interval of the mean of independent values `[n]`; `NONE` if n < `ENOUGH`.
+    """Student's interval of the mean of independent values `[n]`; `UNKNOWN` if n < `ENOUGH`.
 
     First average values that depend on each other, such as the agents that one proxy trained.
     """
     values = np.asarray(values, float)
     if values.size < ENOUGH:
-        return NONE
+        return UNKNOWN
     half = stdtrit(values.size - 1, (1 + LEVEL) / 2) * values.std(ddof=1) / values.size**0.5
     return float(values.mean() - half), float(values.mean() + half)
 

@@ -76,7 +76,7 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(self, outcome: Outcome, for_people: bool = False) -> Float[Array, "*agent"]:
+    def __call__(self, outcome: Outcome, shown: bool = False) -> Float[Array, "*agent"]:
         """The scores that compare candidates, or those that people see; nan for diverged agents.
 
         A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
@@ -84,7 +84,7 @@ class Objective:
         Raises:
           ConfigError: unless there is a score for each agent.
         """
-        score = (for_people and self.shown) or self.score
+        score = (shown and self.shown) or self.score
         scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
         require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
         return jnp.where(outcome.nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)

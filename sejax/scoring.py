@@ -147,9 +147,9 @@ class Scoring:
         population = aggregate(by_candidate, axis=1)  # nan if the agent of one diverged
         return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
 
-    def for_people(self, outcome: Outcome) -> Scores:
+    def shown(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
-        return self._scores(self.objective(outcome, for_people=True))
+        return self._scores(self.objective(outcome, shown=True))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array

@@ -5,6 +5,7 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -76,7 +77,7 @@ class TrainingConfig(Options):
         return self.stop_rule == "solved" and self.solved_by == "test"
 
     @property
-    def num_tests_between(self) -> int:
+    def tests_after_each(self) -> int:
         """Test episodes after each training episode."""
         return max(self.tests_between, int(self.stops_by_tests))
 
@@ -168,7 +169,7 @@ def make_trainer(
     agent: Agent,
     env: Environment,
     training: TrainingConfig = TrainingConfig(),
-    solved_reward: float = jnp.inf,
+    solved_reward: float = math.inf,
     test_fn: TestFn | None = None,
     keeps_stored: bool = False,
     in_batches: bool = True,
@@ -191,13 +192,13 @@ def make_trainer(
         output, as in the authors' code.
       solved_reward: for `stop_rule="solved"`.
       test_fn: plays tests on the real task; called after each training episode if
-        `training.num_tests_between` is not 0.
+        `training.tests_after_each` is not 0.
       keeps_stored: whether the result has what the agent's buffer holds at the end.
       in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
 
     Raises:
       ConfigError: for arguments of the wrong kind, or if `training` has a fixed number of steps and
-        too few episodes for them, or stops at a solved reward that is not given.
+        too few episodes for them, or stops at a solved reward that is not finite.
       ValueError: if tests are asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
@@ -217,13 +218,12 @@ def make_trainer(
     fix = "sejax.make_evaluator draws others."
     require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
     require_part("training", TrainingConfig, training)
-    can_stop = training.stop_rule != "solved" or solved_reward is not jnp.inf
-    require(can_stop, "solved_reward", "must be given with stop_rule=solved")
+    can_stop = training.stop_rule != "solved" or math.isfinite(solved_reward)
+    require(can_stop, "solved_reward", "must be finite with stop_rule=solved", got=solved_reward)
     require_modes()
-    if training.num_tests_between and test_fn is None:
-        number = training.num_tests_between
-        raise ValueError(f"training.num_tests_between={number} needs a test_fn; got None.")
-    test_fn = test_fn if training.num_tests_between else None
+    if training.tests_after_each and test_fn is None:
+        raise ValueError("test_fn must be given, as tests follow each episode; got None.")
+    test_fn = test_fn if training.tests_after_each else None
     # A curve of tests may end at either limit.
     if test_fn is None and (proxy := proxy_in(env)) is not None:
         require_reachable("training", training, proxy.max_steps)

@@ -59,9 +59,9 @@ def test_overrides_are_the_searchs_own_the_space_or_fixed():
     assert search_config.plan_of(["es.noise_std=0.1,1", "es.step_size=1,2", "es.noise_std=3"]).fixed
     search = search_config.plan_of(words)
     assert search.fixed == ("env=acrobot",) and list(search.space) == ["es.noise_std"]
-    assert (search.config.trials, search.study) == (7, "2024-01-01")
+    assert (search.config.trials, search.study_name) == (7, "2024-01-01")
     assert search.folder.name == "search-2024-01-01"
-    assert search_config.plan_of(words[:2]).study == "acrobot-se-ddqn"
+    assert search_config.plan_of(words[:2]).study_name == "acrobot-se-ddqn"
 
 
 def test_what_is_fixed_or_has_a_range_of_its_own_is_left_out_of_the_preset(tmp_path):

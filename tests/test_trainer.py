@@ -129,7 +129,7 @@ def test_tests_between_episodes_are_recorded_and_decide_if_the_rule_asks_for_the
 
 
 def test_a_solved_training_that_is_tested_throughout_goes_on():
-    numbers = {name: VARIANTS[name].num_tests_between for name in ("tested", "plateau", "solved")}
+    numbers = {name: VARIANTS[name].tests_after_each for name in ("tested", "plateau", "solved")}
     assert numbers == {"tested": 1, "plateau": 0, "solved": 0}
     for rule, goes_on in (("tested", "never"), ("plateau", "plateau")):
         throughout = evaluation.tested_throughout(VARIANTS[rule])

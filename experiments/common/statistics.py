@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from sejax.myopia import ENOUGH, LEVEL, NONE
+from sejax.myopia import ENOUGH, LEVEL, UNKNOWN
 from sejax.myopia import mean_interval as mean_interval
 
 
 def difference_interval(first: Any, second: Any) -> tuple[float, float]:
     """Welch's confidence interval of the difference of two means, of independent values `[n], [m]`.
 
-    `NONE` if either has fewer than `ENOUGH` values.
+    `UNKNOWN` if either has fewer than `ENOUGH` values.
     """
     first, second = np.asarray(first, float), np.asarray(second, float)
     if min(first.size, second.size) < ENOUGH:
-        return NONE
+        return UNKNOWN
     errors = np.array([x.var(ddof=1) / x.size for x in (first, second)])
     middle, error = first.mean() - second.mean(), errors.sum()
     if error == 0:

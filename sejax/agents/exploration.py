@@ -206,7 +206,7 @@ class Curious:
         )
 
     def outputs(self, params: PyTree, batch: Transition) -> ICMOutputs:
-        action = as_vectors(batch.action, self.model.action_width)
+        action = action_vectors(batch.action, self.model.action_width)
         return cast(ICMOutputs, self.model.apply(params, batch.obs, action, batch.next_obs))
 
     def train(self, state: CuriousState, batch: Transition) -> CuriousState:
@@ -263,7 +263,7 @@ def icm_loss(
     """
     predicted = outputs.predicted_action
     if action.ndim == 1:  # indices
-        chosen = as_vectors(action, predicted.shape[0])
+        chosen = action_vectors(action, predicted.shape[0])
         inverse = jax.nn.logsumexp(predicted, axis=0) - jnp.sum(chosen * predicted, axis=0)
     else:
         inverse = jnp.mean((predicted - action) ** 2, axis=0)
@@ -276,7 +276,7 @@ def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
     return jnp.mean((outputs.predicted_next_features - outputs.next_features) ** 2, axis=0)
 
 
-def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
+def action_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
     """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
     if action.ndim > 1:
         return action

@@ -46,7 +46,7 @@ from sejax.options import (
     require,
 )
 
-Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
+PerStep = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
 Moved = tuple[PyTree, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
@@ -158,9 +158,9 @@ class Batch(NamedTuple):
 
     obs: Float[Array, "obs_dim steps"]
     action: Array
-    old_log_prob: Steps
-    advantage: Steps | None
-    returns: Steps
+    old_log_prob: PerStep
+    advantage: PerStep | None
+    returns: PerStep
 
 
 class PPO(Algorithm):
@@ -229,14 +229,14 @@ class PPO(Algorithm):
         outputs: Any = self.actor.apply(state.params["actor"], obs)
         return self.sample(key, outputs, state.params["std"]) if explore else self.mode(outputs)
 
-    def value(self, params: PyTree, obs: Array) -> Steps:
+    def value(self, params: PyTree, obs: Array) -> PerStep:
         """The critic's values."""
         outputs: Any = self.critic.apply(params["critic"], obs)
         return outputs[0]
 
     def evaluate_actions(
         self, params: PyTree, obs: Array, action: Array
-    ) -> tuple[Steps, Steps, Steps]:
+    ) -> tuple[PerStep, PerStep, PerStep]:
         """The actions' log probabilities, the entropies and the values."""
         outputs: Any = self.actor.apply(params["actor"], obs)
         log_prob, entropy = self.probabilities(outputs, params["std"], action)
@@ -269,7 +269,7 @@ class PPO(Algorithm):
         )
         return state.replace(params=params, opt_state=opt_state, return_moments=return_moments)
 
-    def prepared(self, state: PPOState, steps: Transition, ended: Steps) -> tuple[Batch, Moments]:
+    def prepared(self, state: PPOState, steps: Transition, ended: PerStep) -> tuple[Batch, Moments]:
         r"""A rollout, evaluated by the parameters that made it, and moments of all returns.
 
         With `advantages="monte_carlo"` returns are normalised. The advantage is the return minus
@@ -339,7 +339,7 @@ class PPO(Algorithm):
         """The likeliest action, for one observation."""
         return jnp.argmax(outputs).astype(jnp.int32)
 
-    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[Steps, Steps]:
+    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[PerStep, PerStep]:
         """The logarithms of the actions' probabilities, and the entropies, in nats."""
         log_probs = jax.nn.log_softmax(outputs, axis=0)
         entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
@@ -366,7 +366,7 @@ class ContinuousPPO(PPO):
     def mode(self, outputs: Array) -> Array:
         return self.max_action * jnp.tanh(outputs)
 
-    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[Steps, Steps]:
+    def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[PerStep, PerStep]:
         standardized = (action - self.mode(outputs)) * (1 / std)[:, None]
         log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
         log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
@@ -399,7 +399,7 @@ def std_of(moments: Moments) -> Float[Array, ""]:
     return jnp.sqrt(jnp.maximum(square / count, 1e-8))
 
 
-def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
+def discounted_sums(x: PerStep, decay: PerStep, ended: PerStep) -> PerStep:
     """Sums :math:`y_t = x_t + decay_t y_{t+1}` within each episode."""
 
     def step(later: Array, terms: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -410,12 +410,12 @@ def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
     return jax.lax.scan(step, jnp.float32(0), (x, decay, ended), reverse=True)[1]
 
 
-def normalized(x: Steps) -> Steps:
+def normalized(x: PerStep) -> PerStep:
     """`x` less its mean, divided by its unbiased std plus 1e-5."""
     std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
     return (x - jnp.mean(x)) * (1 / (std + 1e-5))
 
 
-def bounded_exp(log_ratio: Steps) -> Steps:
+def bounded_exp(log_ratio: PerStep) -> PerStep:
     """Exponential of a log ratio. It is finite however far the policy has moved."""
     return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))

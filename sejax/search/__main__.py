@@ -26,20 +26,20 @@ def main(overrides: Sequence[str]) -> None:
     require_package("sejax.search", "optuna", "search")
     from sejax.search import config, study
 
-    search = config.plan_of(overrides)
+    plan = config.plan_of(overrides)
     runtime.configure_jax()
-    search.default.task()  # raises if this machine cannot make it, before any trial is refused
+    plan.default.task()  # raises if this machine cannot make it, before any trial is refused
     try:
-        current = study.open_study(search)
-        print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
-        study.work(current, search)
-        study.report(current, search)
+        current = study.open_study(plan)
+        print(f"Study {plan.study_name} in {plan.folder}: {', '.join(plan.space)}.", flush=True)
+        study.work(current, plan)
+        study.report(current, plan)
     except study.UNUSABLE as error:
-        got = f"{search.folder / 'study.db'} ({told(error.__cause__ or error)})"
+        got = f"{plan.folder / 'study.db'} ({told(error.__cause__ or error)})"
         must = f"must hold a database that can be used; got {got}"
         raise ConfigError("search_dir", must, use="FOLDER") from error
     except KeyboardInterrupt as stop:
-        saved = f"What has ended is saved in {search.folder}; the same command resumes from there."
+        saved = f"What has ended is saved in {plan.folder}; the same command resumes from there."
         commands.interrupted(f"Interrupted. {saved}", stop)
 
 

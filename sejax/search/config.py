@@ -96,13 +96,13 @@ class StudyPlan:
         return self.trial_config()
 
     @property
-    def study(self) -> str:
+    def study_name(self) -> str:
         """The study's name."""
         return self.config.study or "-".join(map(self.default.name, ("env", "proxy", "agent")))
 
     @property
     def folder(self) -> Path:
-        return Path(self.config.search_dir or Path("runs", f"search-{as_file_name(self.study)}"))
+        return Path(self.config.search_dir or f"runs/search-{as_file_name(self.study_name)}")
 
     def overrides(self, params: Mapping[str, Any]) -> list[str]:
         """The overrides that set the searched fields to stored parameters."""
@@ -138,8 +138,8 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
         require(name.partition(".")[0] not in SET_BY_SEARCH, name, must, got=text, fix=fix)
     space = {name: spaces.parse(name, text) for name, text in ranges.items()}
     fixed = tuple(f"{name}={text}" for name, text in others.items())
-    search = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
-    default, preset = search.default, search.config.space
+    plan = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
+    default, preset = plan.default, plan.config.space
     if preset is not None:
         by_key = default.agents.items()
         agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
@@ -156,4 +156,4 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
         require(is_fit, name, "must be whole numbers", got=x.text, use=use)
     must = "must be given and have ranges for these agents, or fields must have some; got none"
     require(space, "space", must, use=f"paper_se, or es.noise_std='{spaces.EXAMPLE}'")
-    return search
+    return plan

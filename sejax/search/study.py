@@ -38,7 +38,7 @@ UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # errors of a datab
 SHOWN = ["number", "value", "generations", "train_steps", "settings"]  # columns of a trial
 
 
-def open_study(search: StudyPlan) -> optuna.Study:
+def open_study(plan: StudyPlan) -> optuna.Study:
     """Opens the study, or makes it; a new one first tries the current settings, if in range.
 
     Raises:
@@ -46,18 +46,18 @@ def open_study(search: StudyPlan) -> optuna.Study:
       OptunaError, SQLAlchemyError: if the database cannot be used.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    folder = search.folder
+    folder = plan.folder
     with contextlib.suppress(OSError, ValueError):  # what the next line raises
         (folder / "trials").mkdir(parents=True, exist_ok=True)
     require_writable("search_dir", folder / "trials")
-    store = Store(folder, search.settings(), field="search_dir", free=FREE)
-    budgets = search.config.min_generations, search.config.max_generations
+    store = Store(folder, plan.settings(), field="search_dir", free=FREE)
+    budgets = plan.config.min_generations, plan.config.max_generations
     # An address would end at a question mark in the folder's name.
     connect = functools.partial(sqlite3.connect, folder / "study.db", WAIT, check_same_thread=False)
-    with _lock(search, "study"):
+    with _lock(plan, "study"):
         is_new = store.get("search") is None
         study = optuna.create_study(
-            study_name=search.study,
+            study_name=plan.study_name,
             storage=optuna.storages.RDBStorage("sqlite:///study.db", {"creator": connect}),
             pruner=optuna.pruners.HyperbandPruner(*budgets, REDUCTION_FACTOR),
             direction="maximize",
@@ -68,8 +68,8 @@ def open_study(search: StudyPlan) -> optuna.Study:
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
-            fields = search.default.named(search.default.plain())
-            first = {x.parameter: x.parameter_of(fields[name]) for name, x in search.space.items()}
+            fields = plan.default.named(plan.default.plain())
+            first = {x.parameter: x.parameter_of(fields[name]) for name, x in plan.space.items()}
             if None not in first.values():
                 study.enqueue_trial(first, skip_if_exists=True)
             store.put("search")
@@ -131,7 +131,7 @@ def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     return run
 
 
-def work(study: optuna.Study, search: StudyPlan) -> None:
+def work(study: optuna.Study, plan: StudyPlan) -> None:
     """Takes trials until as many have ended as the user asks for.
 
     With several workers a few more may end, as a worker counts before it takes a trial.
@@ -141,12 +141,12 @@ def work(study: optuna.Study, search: StudyPlan) -> None:
     """
     while True:
         with contextlib.ExitStack() as held:
-            with _lock(search, "study"):
-                trial = _claimed(study, search, held)
+            with _lock(plan, "study"):
+                trial = _claimed(study, plan, held)
             if trial is None:
                 return
             try:
-                print(f"trial {trial.number}: {_computed(trial, search)}", flush=True)
+                print(f"trial {trial.number}: {_computed(trial, plan)}", flush=True)
             except Exception as error:
                 mended = (ConfigError, OSError, *UNUSABLE)  # by the user, as own code is
                 if not (isinstance(error, mended) or place_of(error) or platform_error()):
@@ -154,15 +154,15 @@ def work(study: optuna.Study, search: StudyPlan) -> None:
                 raise
 
 
-def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack) -> Trial | None:
+def _claimed(study: optuna.Study, plan: StudyPlan, held: contextlib.ExitStack) -> Trial | None:
     """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
     known = study.get_trials(deepcopy=False)
-    space = {x.parameter: x.distribution for x in search.space.values()}
+    space = {x.parameter: x.distribution for x in plan.space.values()}
     for frozen in known:
         if frozen.state != TrialState.RUNNING:
             continue
         try:
-            held.enter_context(_lock(search, _name(frozen.number), timeout=0))
+            held.enter_context(_lock(plan, _name(frozen.number), timeout=0))
         except filelock.Timeout:  # its worker is alive
             continue
         if study.get_trials(deepcopy=False)[frozen.number].state != TrialState.RUNNING:
@@ -172,16 +172,16 @@ def _claimed(study: optuna.Study, search: StudyPlan, held: contextlib.ExitStack)
         for name, distribution in space.items():  # the trial may lack some parameters
             trial._suggest(name, distribution)
         return trial
-    if sum(trial.state.is_finished() for trial in known) >= search.config.trials:
+    if sum(trial.state.is_finished() for trial in known) >= plan.config.trials:
         return None
     if not any(trial.state == TrialState.WAITING for trial in known):
         # Drawn at once: a worker killed meanwhile leaves no half trial; the next draws the same.
-        seed = np.random.SeedSequence([search.default.seed, len(known)]).generate_state(1)[0]
+        seed = np.random.SeedSequence([plan.default.seed, len(known)]).generate_state(1)[0]
         draft = _copy(study)
         draft.sampler = optuna.samplers.TPESampler(seed=int(seed))
         study.enqueue_trial(draft.ask(space).params)
     trial = study.ask(space)
-    held.enter_context(_lock(search, _name(trial.number)))
+    held.enter_context(_lock(plan, _name(trial.number)))
     return trial
 
 
@@ -206,19 +206,19 @@ def _is_behind(trial: Trial, rung: int) -> bool:
     return bool(trial.user_attrs[name])
 
 
-def _computed(trial: Trial, search: StudyPlan) -> str:
+def _computed(trial: Trial, plan: StudyPlan) -> str:
     """Computes a trial rung by rung, until it is pruned or complete; returns a line about it."""
-    study, overrides = trial.study, search.overrides(trial.params)
-    folder, seeds = search.folder / _name(trial.number), range(search.config.seeds)
+    study, overrides = trial.study, plan.overrides(trial.params)
+    folder, seeds = plan.folder / _name(trial.number), range(plan.config.seeds)
     trial.set_user_attr("settings", shlex.join(overrides))
     try:
-        run = learning(search.trial_config(overrides), folder, seeds)
+        run = learning(plan.trial_config(overrides), folder, seeds)
     except ConfigError as error:  # settings that cannot work together
         trial.set_user_attr("refused", str(error))
         study.tell(trial, state=TrialState.PRUNED)
         return f"refused: {error}"
-    last = search.config.max_generations
-    for rung in search.config.rungs:
+    last = plan.config.max_generations
+    for rung in plan.config.rungs:
         progress = run(rung)
         reported = study.get_trials(deepcopy=False)[trial.number].intermediate_values
         for step in range(len(reported) + 1, rung + 1):
@@ -240,14 +240,14 @@ def _name(number: int) -> str:
     return f"trials/{number:04d}"
 
 
-def _lock(search: StudyPlan, name: str, timeout: float = -1) -> filelock.FileLock:
-    return filelock.FileLock(search.folder / f"{name}.lock", timeout=timeout)
+def _lock(plan: StudyPlan, name: str, timeout: float = -1) -> filelock.FileLock:
+    return filelock.FileLock(plan.folder / f"{name}.lock", timeout=timeout)
 
 
 # --- results --------------------------------------------------------------------------------------
 
 
-def report(study: optuna.Study, search: StudyPlan) -> None:
+def report(study: optuna.Study, plan: StudyPlan) -> None:
     """Prints and writes the results; the best settings are tried again.
 
     Raises:
@@ -255,46 +255,46 @@ def report(study: optuna.Study, search: StudyPlan) -> None:
     """
     rows = study.trials_dataframe(("number", "state", "value", "user_attrs"))
     rows = rows.rename(columns=lambda name: name.removeprefix("user_attrs_"))
-    write_text(search.folder / "trials.csv", rows.to_csv(index=False))
+    write_text(plan.folder / "trials.csv", rows.to_csv(index=False))
     best = rows[rows["state"] == "COMPLETE"]
     if best.empty:
-        raise FailedError(f"No trial was completed. {search.folder}/trials.csv says why.")
+        raise FailedError(f"No trial was completed. {plan.folder}/trials.csv says why.")
     best = best[SHOWN].sort_values(["value", "train_steps"], ascending=[False, True], kind="stable")
     table = best.head(10).to_string(index=False)
     print(f"\nThe best of {len(rows)} trials, of which {len(best)} are complete:\n{table}")
-    if search.config.verify:
-        best = best.head(search.config.verify)[["number", "value", "settings"]]
-        with _lock(search, "verification"):  # another worker may be verifying
-            again = [_tried_again(study, search, number) for number in best["number"]]
+    if plan.config.verify:
+        best = best.head(plan.config.verify)[["number", "value", "settings"]]
+        with _lock(plan, "verification"):  # another worker may be verifying
+            again = [_tried_again(study, plan, number) for number in best["number"]]
         best = best.join(pd.DataFrame(again, index=best.index))
         order = ["verified", "verified_cost"]
         best = best.sort_values(order, ascending=[False, True], kind="stable")
-        write_text(search.folder / "verification.csv", best.to_csv(index=False))
+        write_text(plan.folder / "verification.csv", best.to_csv(index=False))
         print(f"\nThe best {len(best)}, tried again:\n{best.to_string(index=False)}")
-    line = write_best(search.overrides(study.trials[best["number"].iloc[0]].params), search)
-    print(f"\nThe best:\n  {line}\n{search.folder} holds trials.csv, best.txt and preset.yaml.")
+    line = write_best(plan.overrides(study.trials[best["number"].iloc[0]].params), plan)
+    print(f"\nThe best:\n  {line}\n{plan.folder} holds trials.csv, best.txt and preset.yaml.")
 
 
-def _tried_again(study: optuna.Study, search: StudyPlan, number: int) -> dict[str, float]:
+def _tried_again(study: optuna.Study, plan: StudyPlan, number: int) -> dict[str, float]:
     """The score of a trial's settings with seeds that no trial has had, and its generations.
 
     The best score of many is the luckiest too.
     """
-    config, folder = search.config, search.folder / f"verified/{number:04d}"
+    config, folder = plan.config, plan.folder / f"verified/{number:04d}"
     fresh = range(config.seeds, config.seeds + config.fresh_seeds)
-    trial = search.trial_config(search.overrides(study.trials[number].params))
+    trial = plan.trial_config(plan.overrides(study.trials[number].params))
     progress = learning(trial, folder, fresh)(config.max_generations)
     return {"verified": float(progress.scores[-1]), "verified_cost": progress.generations}
 
 
-def write_best(overrides: Sequence[str], search: StudyPlan) -> str:
+def write_best(overrides: Sequence[str], plan: StudyPlan) -> str:
     """Writes settings as a command and as a preset; returns the command."""
     # A preset file of a run names its folder, which holds that run.
-    words = [*search.fixed, *overrides, *["run_dir=null"] * bool(search.default.run_dir)]
+    words = [*plan.fixed, *overrides, *["run_dir=null"] * bool(plan.default.run_dir)]
     line = shlex.join(["python", "-m", "sejax.run", *words])
-    read = search.default.named(LearnConfig.layers_of(words)["typed"])
+    read = plan.default.named(LearnConfig.layers_of(words)["typed"])
     settings = {name: parsed(x) if isinstance(x, str) else x for name, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
-    write_text(search.folder / "best.txt", f"{line}\n")
-    write_text(search.folder / "preset.yaml", f"# {line}\n{text}")
+    write_text(plan.folder / "best.txt", f"{line}\n")
+    write_text(plan.folder / "preset.yaml", f"# {line}\n{text}")
     return line
