@@ -21,7 +21,9 @@ T = TypeVar("T")
 
 @jax.tree_util.register_pytree_node_class
 class Hparams(SimpleNamespace):
-    """Traced hyperparameters of an agent, a pytree; see `traced`.
+    """Hyperparameters that an agent reads from its state, a pytree; see `traced`.
+
+    They are arguments of a compiled program if they vary, and else its constants.
 
     Attributes:
       hidden_size: units in use; None for all.
@@ -101,7 +103,7 @@ class Agent:
       act: `(key, state, obs, explore) -> action`, as the buffer keeps it.
       update: `(key, state, batch) -> state`; one learning step on a batch from `buffer`.
       buffer: how steps are kept, from `sejax.agents.buffers`.
-      hparams: the default traced hyperparameters, a pytree of floats.
+      hparams: the default hyperparameters of `init`, a pytree of floats.
       spec: what is known before it is compiled.
       begin_episode: `(state, episode) -> state`; applies schedules that move with episodes.
       env_action: `action -> action` as the environment takes it.
