@@ -58,6 +58,10 @@ class Reacher(environment.Environment[ReacherState, ReacherParams]):
         distance = jnp.linalg.norm(obs) / params.size
         return obs, state, -distance, distance < 0.1, {}
 
+    @property
+    def default_params(self) -> ReacherParams:
+        return ReacherParams()
+
     def action_space(self, params: ReacherParams) -> spaces.Box:
         return spaces.Box(-1.0, 1.0, (2,), jnp.float32)
 

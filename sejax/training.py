@@ -197,9 +197,9 @@ def make_trainer(
       in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
 
     Raises:
-      ConfigError: for arguments of the wrong kind, or if `training` has a fixed number of steps and
-        too few episodes for them, or stops at a solved reward that is not finite.
-      ValueError: if tests are asked for and no `test_fn` is given.
+      ConfigError: for arguments of the wrong kind; if `training` has a fixed number of steps and
+        too few episodes for them, or stops at a solved reward that is not finite; or if tests are
+        asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
 
@@ -221,8 +221,7 @@ def make_trainer(
     can_stop = training.stop_rule != "solved" or math.isfinite(solved_reward)
     require(can_stop, "solved_reward", "must be finite with stop_rule=solved", got=solved_reward)
     require_modes()
-    if training.tests_after_each and test_fn is None:
-        raise ValueError("test_fn must be given, as tests follow each episode; got None.")
+    require(test_fn or not training.tests_after_each, "test_fn", "must be given, to play tests.")
     test_fn = test_fn if training.tests_after_each else None
     # A curve of tests may end at either limit.
     if test_fn is None and (proxy := proxy_in(env)) is not None:

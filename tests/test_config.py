@@ -368,3 +368,4 @@ def test_an_agent_that_is_typed_takes_the_place_of_those_of_a_file(agent, batch_
         path.write_text(text)
         config = sejax.config([f"preset={path}", f"agent={agent}"])
         assert {key: x.batch_size for key, x in config.agents.items()} == {agent: batch_size}
+        assert sejax.config([f"preset={path}", "agent.batch_size=9"]).agent.batch_size == 9

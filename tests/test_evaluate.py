@@ -86,6 +86,10 @@ def test_one_agent_has_no_deviation(tmp_path, capsys):
     assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
 
 
+class OwnPPO(PPOConfig):  # which is not registered
+    pass
+
+
 def budget_for(training, agent, learned_with, length):
     """The training on an SE of cartpole of this length, 1 or 200, that others were learned with."""
     config = sejax.SyntheticConfig(hidden_size=2, horizon=1 if length == 1 else None)
@@ -99,10 +103,10 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
     (then,), training = proxy.learned_agents().values(), sejax.training_of(proxy)
     waits = dataclasses.replace(then, warmup_episodes=3)
-    long, short = (paper_ppo(update_episodes=number) for number in (2, 1))
+    long, short, own = (*(paper_ppo(update_episodes=x) for x in (2, 1)), OwnPPO())
     for agent, learned_with, length, budget in (
         (then, [then], 200, 50), (waits, [then], 200, 50 + 3 * 200), (long, [then], 200, 50 + 401),
-        (then, [], 200, 50),  # nobody knows what it was learned with
+        (own, [own], 200, 50), (then, [], 200, 50),  # nobody knows what it was learned with
         (long, [then, short], 200, 50 + 200),  # the one that waits longest counts
         # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
         (long, [then], 1, 50 + 401), (waits, [then], 1, 50 + 3),

@@ -93,13 +93,13 @@ def test_steps_are_those_of_gymnax_as_vectors(gymnax_id):
 def test_limit_and_threshold_are_those_asked_for_or_known():
     assert task_of("CartPole-v1").max_steps == 500
     task = task_of("CartPole-v1", max_steps=7, solved_reward=100)
-    assert task.max_steps == task.params.max_steps_in_episode == 7
-    assert task.solved_reward == 100.0
+    assert task.max_steps == task.params.max_steps_in_episode == 7 and task.solved_reward == 100
     proxy = registry.make("proxy", paper_se(hidden_size=2), task)
     assert proxy.default_params.max_steps_in_episode == 7
     for limit in (0, 2**31):
         assert refused(task_of, "CartPole-v1", max_steps=limit) == "env.max_steps"
     assert {x: task_of(x).solved_reward for x in SOLVED_REWARD} == SOLVED_REWARD
+    assert not task_of("MountainCar-v0", max_steps=100).is_solvable  # -100 is its worst return
     unknown = task_of("Catch-bsuite")
     assert unknown.solved_reward == math.inf and not unknown.is_solvable
     assert refused(sejax.RewardThreshold().make, unknown) == "objective"
@@ -232,6 +232,8 @@ class Limit(NamedTuple):
     (changed(reward=np.zeros(2)), {}, "env"),
     (gymnax.make("CartPole-v1"), {}, "env"),  # a pair
     (Plain(), {"params": Limit(), "max_steps": 5}, "env"),
+    (changed(action_space=lambda self, params: spaces.Discrete(params.max_steps_in_episode)),
+     {"params": gymnax.EnvParams(max_steps_in_episode=5)}, "env"),
     (Plain(), {"params": gymnax.EnvState(time=0)}, "env"),
     (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "env"),  # whose step is never called
     (Plain(), {"solved_reward": "high"}, "env.solved_reward"),

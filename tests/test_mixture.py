@@ -21,8 +21,7 @@ NAN, INF = np.nan, np.inf
 KEY = jax.random.key(0)
 TASK = envs.make("gridworld_2x2")
 SARSA = sejax.SARSAConfig(learning_rate=0.3, epsilon_init=0.7, epsilon_min=0.7)
-CONFIGS = sejax.QLearningConfig(learning_rate=0.5), SARSA
-AGENTS = tuple(sejax.make_agent(config, TASK) for config in CONFIGS)
+AGENTS = tuple(sejax.make_agent(x, TASK) for x in (sejax.QLearningConfig(learning_rate=0.5), SARSA))
 
 
 def mixture(num=2, weights=(), **config):

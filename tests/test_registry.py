@@ -225,9 +225,8 @@ def test_a_plugin_must_make_what_its_group_is_of(module):
 def test_a_module_that_is_not_there_or_raises_is_one_message(module):
     assert "ModuleNotFoundError" in refused("agent", "no_such_module_at_all:Agent")
     said = refused("agent", f"{module('raise RuntimeError(chr(10).join([chr(120)] * 9000))')}:A")
-    assert re.search(
-        r"raised RuntimeError: x.*\(mine_\d+\.py:1: raise RuntimeError\(.*\)\)\.$", said
-    )
+    raised = r"raised RuntimeError: x.*\(mine_\d+\.py:1: raise RuntimeError\(.*\)\)\.$"
+    assert re.search(raised, said)
 
 
 @pytest.mark.parametrize(("typed", "meant"), [

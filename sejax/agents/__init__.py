@@ -1,4 +1,4 @@
-"""Agents: bundles of pure functions. An algorithm and its variants are one file, with their options.
+"""Agents: bundles of pure functions. An algorithm and its variants share a file with their options.
 
 Here are also the parts for an agent of your own: `AgentOptions` for its configuration, `traced` for
 the hyperparameters that compiled programs take as arguments, and the buffers.

@@ -83,6 +83,8 @@ class Task(TaskSpec):
             require_own_steps(env)
             vectors = as_vectors(env, params)
             observation, action = spaces_of(vectors, params)
+            sizes = [[(type(x), x.size) for x in spaces_of(vectors, y)] for y in (None, params)]
+            options.require(sizes[0] == sizes[1], "env", "needs its own default_params", got=name)
             if not type(env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(vectors, params, name)  # takes seconds; the others have tests
         except options.ConfigError:

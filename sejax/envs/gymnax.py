@@ -27,7 +27,7 @@ class GymnaxTask(Options):
     """An environment of gymnax, or one that another package has registered there.
 
     Attributes:
-      solved_reward: mean return that counts as solved; null: Gymnasium's
+      solved_reward: mean return that counts as solved; null: Gymnasium's, with gymnax's step limit
       max_steps: step limit; null: gymnax's
 
     Raises:
@@ -52,7 +52,8 @@ class GymnaxTask(Options):
         except Exception as error:  # such as a data set that cannot be fetched
             must = f"must be one that gymnax makes; {gymnax_id} raised {options.told(error)}."
             raise options.ConfigError("env", must) from error
-        usual = SOLVED_REWARD.get(gymnax_id, math.inf)
-        solved = usual if self.solved_reward is None else self.solved_reward
         max_steps = self.max_steps or params.max_steps_in_episode
+        is_usual = max_steps == params.max_steps_in_episode
+        usual = SOLVED_REWARD.get(gymnax_id, math.inf) if is_usual else math.inf
+        solved = usual if self.solved_reward is None else self.solved_reward
         return Task(name=self.name, env=env, solved_reward=solved, max_steps=max_steps)

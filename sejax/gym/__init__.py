@@ -34,5 +34,4 @@ __all__ = [
     "register",
 ]
 
-SyntheticEnv = SyntheticGymEnv  # its older name
 register()

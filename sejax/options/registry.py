@@ -333,7 +333,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
     must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field"
     is_fit = len(parameters) >= len(arguments) and not is_open
-    is_fit &= all(p.name != "name" for p in options)  # which is the choice's own
+    is_fit &= all(p.name not in ("name", "make") for p in options)  # which every choice has
     require(is_fit, group, must, got=f"{name}{signature}")
 
     def make(self: object, *parts: object) -> Any:

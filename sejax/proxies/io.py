@@ -226,10 +226,10 @@ def training_of(
     must = f"must be given for {shortened(env.name)}, whose file does not tell it; got none"
     require(isinstance(stored, Mapping), "training", must, use="sejax.TrainingConfig(...)")
     training = from_plain(TrainingConfig, stored, "training")
-    if agent is None or training.max_steps is None:
+    agents, limits = config["agents"].values(), (env.max_steps, env.task.max_steps)
+    if agent is None or training.max_steps is None or to_plain(agent, "agent") in agents:
         return training
     registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
-    agents, limits = config["agents"].values(), (env.max_steps, env.task.max_steps)
     known = [configure("agent", x, ()) for x in agents if header.is_registered("agent", x)]
     waited = max((x.steps_before_learning(*limits) for x in known), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)

@@ -125,7 +125,7 @@ class CommandConfig(Options, ABC):
             known = [key for key, x in classes.items() if name.split(".")[0] in fields_of(x)]
             fix = f"Set agents.{(known or [*chosen])[0]}.{name}={shortened(value)}."
             require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
-        typed["agents"] = merge({next(iter(chosen)): of_only}, typed["agents"])
+        typed["agents"] = merge(typed["agents"], {next(iter(chosen)): of_only})
         return layers | {"typed": typed}
 
     @classmethod
