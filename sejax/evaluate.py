@@ -13,7 +13,6 @@ import dataclasses
 import itertools
 import json
 import math
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -179,11 +178,13 @@ def help_text(overrides: Sequence[str]) -> str:
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
-    make = EvaluateConfig.of_words
-    configs = compose.swept(overrides, make, "out_dir", _folder_of, known=("proxy",))
+    configs = compose.swept(overrides, EvaluateConfig.of_words, "out_dir", _folder_of, ("proxy",))
     if len(configs) == 1:
         return configs
-    return [dataclasses.replace(x, out_dir=x.out_dir or _folder_of(x)) for x in configs]
+    configs = [dataclasses.replace(x, out_dir=x.out_dir or _folder_of(x)) for x in configs]
+    are_apart = len({x.out_dir for x in configs}) == len({str(x) for x in configs})
+    require(are_apart, "out_dir", "must differ for each evaluation. Set proxy to one of them.")
+    return configs
 
 
 def _folder_of(config: EvaluateConfig, name: str = "") -> str:
@@ -293,10 +294,8 @@ def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> Tra
 def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -> pd.DataFrame:
     """A row for each agent of an algorithm; `agent` is its number, of several its key."""
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
-    started = time.time()
     print(f"training {config.num_agents:,} {who} on {name} ...", flush=True)
     columns = train(config, world, key)
-    print(f"{name}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if len(config.agents) > 1:
         numbers = {"agent": key, "number": range(config.num_agents)}

@@ -146,8 +146,7 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     configs = run.configs_of(["run_dir=", "seed=0,1"])  # an empty variable of a shell
-    names = [x.resolved_run_dir.name for x in configs]
-    assert names == ["cartpole-se-ddqn-s0", "cartpole-se-ddqn-s1"]
+    assert {x.resolved_run_dir.name for x in configs} == {f"cartpole-se-ddqn-s{i}" for i in (0, 1)}
     assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
     assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
     folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
@@ -156,6 +155,7 @@ def test_the_runs_of_a_sweep_have_folders_of_their_own():
     assert folder.out_dir == "runs/evaluate-real-acrobot_seed_1"
     configs = evaluate.configs_of(["proxy=a/proxy.safetensors,a/proxy_last.safetensors"])
     assert len({x.out_dir for x in configs}) == 2
+    assert refusal(evaluate.configs_of, ["proxy=runs/a_b,runs/a/b"]).field == "out_dir"
 
 
 # --- preset files ---------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agents=[ddqn,ppo] agents.ppo.tau=1", "agents.ppo.tau", "of agents.ppo=ddqn, "),
     ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
     ("agents=[ddqn,ppo] agents.ppo.epoch=3", "agents.ppo.epoch", "agents.ppo.epochs?"),
-    ("mixture.aggregate=min", "mixture", "agents=[ddqn,ppo]"),
+    ("mixture.aggregate=min", "mixture", "agents=[ddqn,ppo]"), ("es.loss=squared", "es.loss", ""),
     ("preset=paper env=mountain_car", "preset", "preset=best"),
     (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
     ("es.population_size=1.5", "es.population_size", ""), ("agents=[ddqn,td3]", "agents.td3", ""),

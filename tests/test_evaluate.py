@@ -75,7 +75,7 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
     steps = summary["the real task"]["sarsa"]["train_steps_mean"]
     assert steps == pytest.approx(of_sarsa.train_steps.mean())
     printed = capsys.readouterr().out
-    assert "2 fresh agents of each algorithm" in printed and printed.count("sarsa") == 6
+    assert "2 fresh agents of each algorithm" in printed and printed.count("sarsa") == 4
 
 
 def test_one_agent_has_no_deviation(tmp_path, capsys):

@@ -27,7 +27,7 @@ from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, field_lines, option, require, shortened
-from sejax.options.plain import fields_of, flatten, merge
+from sejax.options.plain import defaults_of, flatten, merge
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
@@ -98,7 +98,7 @@ class DistillConfig(LearnConfig):
         return Path(self.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
 
 
-OWN = fields_of(DistillConfig).keys() - fields_of(LearnConfig).keys()
+OWN = defaults_of(DistillConfig).keys() - defaults_of(LearnConfig).keys()
 
 
 def main(overrides: Sequence[str]) -> None:

@@ -6,9 +6,10 @@ from typing import Any
 from sejax.options import registry
 
 # Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
-GONE: dict[str, object] = {"torso": None, "num_filters": 16, "loss": "squared"}
-GONE |= {"compared_by": "advantage", "reward_slope": 1.0, "horizon_is_terminal": True}
-GONE |= {"noisy_tests": False, "train_every": 1, "gradient_steps": 1, "target_update_every": 1}
+GONE: dict[str, object] = {"agent.torso": None, "agent.num_filters": 16, "agent.loss": "squared"}
+GONE |= {f"agent.{x}": 1 for x in ("train_every", "gradient_steps", "target_update_every")}
+GONE |= {"agent.noisy_tests": False, "mixture.compared_by": "advantage"}
+GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True}
 
 
 def of_today(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -97,11 +97,11 @@ def configure(
     require(is_choice, where, "must be a choice with its fields", got=values, use="NAME")
     with errors_of(group, where):
         cls = registry.find(group, values["name"], imports)
-    known = fields_of(cls)
+    known = defaults_of(cls)
     fields = {k: v for k, v in values.items() if k != "name" or k in known}
     for field in [name for name in fields if name not in known]:
         built_in = registry.BUILT_IN[group]
-        others = [x for x in built_in if field in fields_of(registry.find(group, x))]
+        others = [x for x in built_in if field in defaults_of(registry.find(group, x))]
         message = f"is a field of {where}={', '.join(others)}. Set one of them."
         require(not others, f"{where}.{field}", message)
     return from_plain(cls, fields, where, imports)
@@ -121,10 +121,11 @@ def from_plain(
     Raises:
       ConfigError: for an unknown field, a missing one, or a value of another type.
     """
-    hints, defaults, fields = hints_of(cls, where), fields_of(cls), {}
+    hints, defaults, fields = hints_of(cls, where), defaults_of(cls), {}
+    group = getattr(cls, "group", where)
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
-        if name not in defaults and old.GONE.get(name, MISSING) == value:
+        if name not in defaults and old.GONE.get(f"{group}.{name}", MISSING) == value:
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
@@ -136,11 +137,11 @@ def from_plain(
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
         require(is_known, full[name], "must be given; it has no default", use="VALUE")
-    with errors_of(getattr(cls, "group", where), where):
+    with errors_of(group, where):
         return cls(**fields)
 
 
-def fields_of(cls: type) -> dict[str, Any]:
+def defaults_of(cls: type) -> dict[str, Any]:
     """The defaults of a dataclass's fields by their names; `MISSING` for a field without one."""
     return {
         field.name: field.default if field.default_factory is MISSING else field.default_factory()
@@ -155,7 +156,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    is_no = "is no field any more" if last in old.GONE else "is no field"
+    is_no = "is no field" + " any more" * any(x.endswith(f".{last}") for x in old.GONE)
     return ConfigError(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
@@ -182,7 +183,7 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
             value = {"name": registry.name_of(field.group, field.default), **value}
         return configure(field.group, value, field.imports, field.name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
-        must = f"must have fields, as {field.name}.{next(iter(fields_of(hint)), 'name')}"
+        must = f"must have fields, as {field.name}.{next(iter(defaults_of(hint)), 'name')}"
         require(isinstance(value, Mapping), field.name, must, got=repr(value), fix="Leave it out.")
         base = to_plain(field.default) if isinstance(field.default, hint) else {}
         return from_plain(hint, base | value, field.name, field.imports)

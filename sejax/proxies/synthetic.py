@@ -205,7 +205,7 @@ class SyntheticEnv(ProxyEnv):
             self.spaces = Box.symmetric(*[MAX_ABS_VALUE] * task.obs_dim), task.action
 
     def init_weights(self, key: Array) -> dict[str, Any]:
-        """Random weights of each network: "state", "reward", "done", and "start" if learned."""
+        """Random weights of each network that the SE has: "state", "reward", "done", "start"."""
         # "start" always takes a key, so that stored runs keep their numbers.
         keys = jax.random.split(key, len(self._networks.keys() | {"start"}))
         return {

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import yaml
 
 from sejax.options import require
-from sejax.options.plain import fields_of, from_plain, to_plain
+from sejax.options.plain import defaults_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
 CARD = Path(__file__).with_name("card.md")
@@ -130,7 +130,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     """
     path, _, learned = stored
     record, config = learned.proxies[0], learned.config
-    values = {x: record[x] for x in fields_of(PretrainedProxy) if record.get(x) is not None}
+    values = {x: record[x] for x in defaults_of(PretrainedProxy) if record.get(x) is not None}
     if "score" in record:
         values.setdefault("scores", dict.fromkeys(config["agents"], float(record["score"])))
     objective = config.get("objective")

@@ -26,7 +26,7 @@ import yaml
 
 from sejax.ops.files import as_file_name
 from sejax.options import ConfigError, Options, old, registry, require, require_known, shortened
-from sejax.options.plain import expanded, fields_of, flatten, merge, split, unquoted
+from sejax.options.plain import defaults_of, expanded, flatten, merge, split, unquoted
 from sejax.options.registry import key_of
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
@@ -83,7 +83,7 @@ def partition(overrides: Sequence[str], command: type) -> tuple[Tree, dict[str, 
     Raises:
       ConfigError: as `words`.
     """
-    own, others, known = Tree(), dict[str, str](), fields_of(command)
+    own, others, known = Tree(), dict[str, str](), defaults_of(command)
     for name, text in words(overrides).items():
         group, _, field = name.partition(".")
         if group in known:

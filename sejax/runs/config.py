@@ -38,7 +38,7 @@ from sejax.options import (
 )
 from sejax.options.plain import (
     configure,
-    fields_of,
+    defaults_of,
     flatten,
     from_plain,
     merge,
@@ -122,7 +122,7 @@ class CommandConfig(Options, ABC):
         chosen = compose.names_of(merge(*layers.values())["agents"])
         for name, value in flatten(of_only).items():
             classes = {key: registry.find("agent", x, imports) for key, x in chosen.items()}
-            known = [key for key, x in classes.items() if name.split(".")[0] in fields_of(x)]
+            known = [key for key, x in classes.items() if name.split(".")[0] in defaults_of(x)]
             fix = f"Set agents.{(known or [*chosen])[0]}.{name}={shortened(value)}."
             require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
         typed["agents"] = merge(typed["agents"], {next(iter(chosen)): of_only})

@@ -40,7 +40,7 @@ class FinishedGeneration:
 
     Attributes:
       generation: its number, from 0 on.
-      values: the columns of `metrics.csv`.
+      values: the columns of `metrics.csv`, but for `generation` and `seed`.
       scores: the finite scores of the population's evaluations, `[evaluation]`.
       train_steps: steps of all trainings.
     """

@@ -10,7 +10,7 @@ from optuna.distributions import FloatDistribution
 
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
-from sejax.options.plain import fields_of, from_plain, to_plain, unknown_field
+from sejax.options.plain import defaults_of, from_plain, to_plain, unknown_field
 from sejax.runs import compose
 from sejax.runs.config import LearnConfig
 from sejax.search import spaces
@@ -125,7 +125,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
     by_name = {override.partition("=")[0]: override for override in overrides}  # the last counts
-    searched = by_name.keys() - fields_of(StudyConfig).keys()
+    searched = by_name.keys() - defaults_of(StudyConfig).keys()
     texts = {name: x.partition("=")[2] for name, x in by_name.items() if name in searched}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
     rest = [override for name, override in by_name.items() if name not in ranges]
