@@ -32,7 +32,7 @@ from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
 from sejax.runs.compose import Tree
-from sejax.runs.config import REAL_TRAINING, TRAINING, CommandConfig, default_agent
+from sejax.runs.config import REAL_TRAINING, CommandConfig, default_agent
 from sejax.training import TrainingConfig
 
 # Columns of the table: what they show, and with how many digits.
@@ -87,9 +87,6 @@ class EvaluateConfig(CommandConfig):
         for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
             is_idle = self.proxy == "real" and getattr(self, name) == idle
             require(not is_idle, name, "must be left out with proxy=real", got=idle)
-        fix = "" if self.proxy == "real" else "training_from=config, or "
-        message = f"must be left out, as it is idle here. Set {fix}real_training.*."
-        require(self.training_from == "config" or self.training == TRAINING, "training", message)
 
     @classmethod
     def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
@@ -106,6 +103,8 @@ class EvaluateConfig(CommandConfig):
         """
         fix = "Set proxy=RUN_DIR, FILE, cartpole, or real."
         require("proxy" in typed, "proxy", "must be given", fix=fix)
+        is_used = "training" not in typed or typed.get("training_from") == "config"
+        require(is_used, "training", "must come with training_from=config, or be real_training.*.")
         names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
         is_learned = hparams == "as_learned" or (not names and hparams is None)
         stored, learned, default = None, Tree(), ""

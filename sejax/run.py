@@ -19,7 +19,7 @@ from sejax.bilevel import make_bilevel
 from sejax.options import FailedError, require
 from sejax.runs import commands, compose, runtime, session
 from sejax.runs import config as configuration
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import IN_RUN_DIR, LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
 
@@ -45,8 +45,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     def folder_of(config: LearnConfig, name: str) -> str:
         return f"{config.resolved_run_dir}_{name}"
 
-    known = configuration.IN_RUN_DIR
-    configs = compose.swept(overrides, LearnConfig.of_words, "run_dir", folder_of, known)
+    configs = compose.swept(overrides, LearnConfig.of_words, "run_dir", folder_of, IN_RUN_DIR)
     runs: list[LearnConfig] = []
     for config in configs:
         for seed in range(config.seed, config.seed + config.num_seeds):

@@ -232,17 +232,14 @@ def has_compiler():
 
 def outcome_of(returns):
     """The outcome of agents with these test returns; nan for those that diverged."""
-    returns = jnp.float32(returns)
-    counts = jnp.ones(returns.shape, jnp.int32)
+    returns, counts = jnp.float32(returns), jnp.ones(len(returns), jnp.int32)
     return Outcome(
         test_returns=returns[:, None], scored_returns=returns[:, None], train_steps=counts,
         train_episodes=counts, auc=returns, nonfinite=~jnp.isfinite(returns), real_steps=counts,
     )  # fmt: skip
 
 
-def evaluation(words):
-    """The configuration of an evaluation."""
-    return EvaluateConfig.of_words(words)
+evaluation = EvaluateConfig.of_words
 
 
 def forge(path, **config):

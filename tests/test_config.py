@@ -47,8 +47,7 @@ def test_every_task_composes_with_every_preset(env, preset):
 
 def test_a_task_chooses_its_agent_and_a_proxy_its_objective():
     names = {"acrobot": "ddqn", "cliff_walking": "q_learning", "pendulum": "td3", "ant": "td3"}
-    for env, agent in names.items():
-        assert sejax.config([f"env={env}"]).name("agent") == agent
+    assert {env: sejax.config([f"env={env}"]).name("agent") for env in names} == names
     assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
     assert sejax.config(["proxy=rn"]).name("objective") == "reward_threshold"
     assert sejax.config(["proxy=rn", "objective=max_reward"]).name("objective") == "max_reward"
@@ -258,8 +257,7 @@ def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
 
 
 def test_parts_that_only_a_task_can_judge_are_refused_by_their_agents_name():
-    config = sejax.config(["agents=[ddqn,ppo]", "agents.ppo.num_minibatches=100"])
-    error = refusal(config.parts)
+    error = refusal(sejax.config(["agents=[ddqn,ppo]", "agents.ppo.num_minibatches=100"]).parts)
     assert error.field == "agents.ppo.num_minibatches" and f"Set {error.field}=64." in str(error)
 
 
@@ -274,7 +272,7 @@ def test_a_configuration_made_in_python_holds_configurations(part):
     ("proxy=real env=cartpole training.max_steps=9", "training"),
     ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
     ("proxy=cartpole agent.discount=0.5", "agent.discount"), ("proxy=real env.length=2", "env"),
-    ("proxy=cartpole training.max_steps=3", "training"), ("proxy=cartpole agent=2", "agent"),
+    ("proxy=cartpole training.max_steps=2000", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
     ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture"),
 ])  # fmt: skip
@@ -369,3 +367,8 @@ def test_an_agent_that_is_typed_takes_the_place_of_those_of_a_file(agent, batch_
         config = sejax.config([f"preset={path}", f"agent={agent}"])
         assert {key: x.batch_size for key, x in config.agents.items()} == {agent: batch_size}
         assert sejax.config([f"preset={path}", "agent.batch_size=9"]).agent.batch_size == 9
+    path.write_text("agents: {a: {name: ddqn, tau: 0.5}, b: {name: sac, tau: 0.5}}")
+    config = sejax.config([f"preset={path}", "agents.a=ddqn", "agents.b=td3_discrete"])
+    assert [x.tau for x in config.agents.values()] == [0.5, sejax.TD3Config().tau]
+    path.write_text("agent.tau: 0.5")
+    assert sejax.config([f"preset={path}", "agents.ddqn.tau=0.7"]).agent.tau == 0.7

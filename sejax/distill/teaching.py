@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, PyTree
 
-from sejax.agents import make_agent
 from sejax.agents.base import Agent
 from sejax.distill.policy_search import Arrays, Lesson
 from sejax.evaluation import evaluate_agents
@@ -49,8 +48,8 @@ def students(
     lines = [(x.generation, x.policy_return, "", i) for x in lessons for i in range(len(keys))]
     rows = pd.DataFrame(lines, columns=names)
     tables = []
-    for key, agent_config in config.agents.items():
-        agent = make_agent(agent_config, ses[0][0].task, config.exploration)
+    for key in config.agents:
+        agent = config.agent_for(key, ses[0][0].task, is_varied=False)
         train = functools.partial(teach, ses, agent, config, keys)
         taught = store.once(f"students/{key}-{taught_by}", train)
         table = rows.assign(agent=key, **{column: taught[column] for column in COLUMNS})

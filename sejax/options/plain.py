@@ -173,11 +173,10 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
     """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf."""
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
-        names = {key: f"{field.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
-        if field.group and len(names) == 1:  # an only agent's fields are `agent.FIELD`
-            names = dict.fromkeys(names, field.group)
+        one = field.group if len(value) == 1 else None  # an only agent's fields are `agent.FIELD`
+        names = {key: one or f"{field.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
         fields = {key: field._replace(name=x, default=MISSING) for key, x in names.items()}
-        return {str(key): _read(value[key], of_key, one) for key, one in fields.items()}
+        return {str(key): _read(value[key], of_key, x) for key, x in fields.items()}
     if field.group:
         if isinstance(value, Mapping) and field.default is not MISSING:
             value = {"name": registry.name_of(field.group, field.default), **value}

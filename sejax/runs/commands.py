@@ -16,6 +16,7 @@ from typing import NoReturn
 import yaml
 
 from sejax.options import ConfigError, FailedError, place_of, told
+from sejax.options.plain import merge
 from sejax.runs import compose, runtime
 from sejax.runs.config import CommandConfig
 
@@ -72,7 +73,7 @@ def _devices(overrides: Sequence[str]) -> int | None:
     with contextlib.suppress(ConfigError):  # the command raises it later
         known = ("devices", "machines", "machines.name", "preset")  # which may tell
         overrides = [word for word in overrides if word.partition("=")[0] in known]
-        trees = [compose.tree_of(words, ["machines"]) for words in compose.expand(overrides)]
+        trees = [merge(*compose.trees_of(x, ["machines"])) for x in compose.expand(overrides)]
         here = [tree.get("machines", {}).get("name", "local") == "local" for tree in trees]
         counts = [str(x.get("devices", "")) if y else "1" for x, y in zip(trees, here, strict=True)]
         if all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts):

@@ -1,7 +1,7 @@
 """From the words that a user types to nested plain values: the first half of `runs.config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts; `tree_of` makes a tree of them, over the file that `preset=FILE.yaml` names. `runs.config`
+texts; `trees_of` makes a tree of them, and of the file that `preset=FILE.yaml` names. `runs.config`
 lays this tree over the layers below it: the choices that no word makes, and the preset, or the
 settings that a stored proxy was learned with. Names are checked later, when the tree becomes
 dataclasses.
@@ -65,14 +65,14 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         if not (equals and NAME.fullmatch(name)):
             field = shortened(name.strip("- ") or "NAME")
             is_field = name.startswith("-") or name in registry.GROUPS
-            fix = f"{field}={text or 'VALUE'}" if is_field else f"env={field} or proxy={field}"
-            fix = f"Write {shortened(fix)}."
+            value = f"{field}={shortened(text) or 'VALUE'}"
+            fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
-        fix = shortened(f"{text.rstrip(',')}]" if is_open else first)
-        message = "must be one value; a list stands in brackets, without spaces"
-        require(not (others or is_open), name, message, got=text, use=fix)
+        use = shortened(f"{text.rstrip(',')}]" if is_open else first)
+        rule = "must be one value; a list stands in brackets, without spaces"
+        require(not (others or is_open), name, rule, got=text, use=use)
         texts[CHOICES.get(name, name)] = text
     return texts
 
@@ -93,8 +93,8 @@ def partition(overrides: Sequence[str], command: type) -> tuple[Tree, dict[str, 
     return own, others
 
 
-def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
-    """The tree of words, over the one of the file that `preset=FILE.yaml` names.
+def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
+    """The tree of words; before it the one of the file that `preset=FILE.yaml` names.
 
     Args:
       overrides: as typed after a command.
@@ -104,17 +104,17 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
       ConfigError: as `words`, and for a file that cannot be read.
 
     Example:
-      >>> tree_of(["agent=ddqn", "es.noise_std=0.1"], ["es"])
-      {'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}
+      >>> trees_of(["agent=ddqn", "es.noise_std=0.1"], ["es"])
+      [{'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}]
     """
     texts: Tree = {name: unquoted(text) for name, text in words(overrides).items()}
     if not texts.get("preset", "").endswith((".yaml", ".yml")):
-        return _tree(texts, groups)
+        return [_tree(texts, groups)]
     path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
     try:
         values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
-        return merge(_without_replaced(file, typed, groups), typed)
+        return [_without_replaced(file, typed, groups, {"agent", "agents"} & texts.keys()), typed]
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -122,8 +122,15 @@ def tree_of(overrides: Sequence[str], groups: Collection[str]) -> Tree:
         raise ConfigError("preset", must, use="best") from error
 
 
-def _without_replaced(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
-    """The tree of a file without what typed choices replace: other choices' fields, and agents."""
+def _without_replaced(file: Tree, typed: Tree, groups: Collection[str], chosen: set[str]) -> Tree:
+    """The tree of a file without what typed choices replace: other choices' fields, and agents.
+
+    Args:
+      file: the file's tree.
+      typed: the words' tree.
+      groups: see `trees_of`.
+      chosen: names of words that choose all agents; `agents.KEY=ppo` chooses one.
+    """
     for group in groups:
         name = typed.get(group, {}).get("name")
         if name is not None and file.get(group, {}).get("name", name) != name:
@@ -132,11 +139,14 @@ def _without_replaced(file: Tree, typed: Tree, groups: Collection[str]) -> Tree:
     if len(named) == 1:
         file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
     if names := names_of(typed["agents"]):
-        file["agents"] = {key: x for key, x in named.items() if key in names}
+        keys = names.keys() if chosen else named.keys() | names.keys()
+        others = {k for k, x in names_of(named).items() if names.get(k, x) != x}
+        file["agents"] = {key: x for key, x in named.items() if key in keys - others}
         mixture = dict(file.pop("mixture", {}))
-        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in names}
-        if len(names) > 1:
+        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in keys}
+        if len(keys) > 1:
             file["mixture"] = mixture | {"weights": weights}
+            file.pop("agent", None)
     return file
 
 
@@ -249,7 +259,7 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     agent.
 
     Args:
-      typed: see `tree_of`, with the names of all agents.
+      typed: the merged `trees_of`, with the names of all agents.
       imports: each `module:attribute` that may be imported.
 
     Raises:

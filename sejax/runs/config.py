@@ -56,7 +56,7 @@ from sejax.training import TrainingConfig, require_reachable
 if TYPE_CHECKING:  # which imports this module
     from sejax.runs.chunks import Chunks, Pool
 
-TRAINING = TrainingConfig()  # for proxies
+# On the real task.
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Fields that the default run directory is named by.
 IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
@@ -80,7 +80,7 @@ class CommandConfig(Options, ABC):
 
     agents: dict[str, AgentConfig] = plugins("agent")
     exploration: ExplorationConfig = plugin("exploration")
-    training: TrainingConfig = TRAINING
+    training: TrainingConfig = TrainingConfig()
     seed: WholeNumber = 0
     num_parallel: Count | None = None
     devices: Count | None = None
@@ -96,7 +96,7 @@ class CommandConfig(Options, ABC):
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
-          typed: the tree of the words; see `sejax.runs.compose.tree_of`.
+          typed: the tree of the words; see `sejax.runs.compose.trees_of`.
           imports: each `module:attribute` that may be imported.
 
         Raises:
@@ -116,17 +116,17 @@ class CommandConfig(Options, ABC):
     @classmethod
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
-        typed, imports = compose.tree_of(overrides, cls.groups()), compose.plugin_paths(overrides)
-        layers = cls.layers_below(typed, imports)
-        of_only = typed.pop("agent", {})
+        trees, imports = compose.trees_of(overrides, cls.groups()), compose.plugin_paths(overrides)
+        layers = cls.layers_below(merge(*trees), imports)
         chosen = compose.names_of(merge(*layers.values())["agents"])
-        for name, value in flatten(of_only).items():
+        for name, value in flatten(merge(*(x.get("agent", {}) for x in trees))).items():
             classes = {key: registry.find("agent", x, imports) for key, x in chosen.items()}
             known = [key for key, x in classes.items() if name.split(".")[0] in defaults_of(x)]
             fix = f"Set agents.{(known or [*chosen])[0]}.{name}={shortened(value)}."
             require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
-        typed["agents"] = merge(typed["agents"], {next(iter(chosen)): of_only})
-        return layers | {"typed": typed}
+        for tree in trees:
+            tree["agents"] = merge(tree["agents"], {next(iter(chosen)): tree.pop("agent", {})})
+        return layers | {"typed": merge(*trees)}
 
     @classmethod
     def of_tree(cls, tree: Tree, imports: Collection[str] | None) -> Self:

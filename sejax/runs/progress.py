@@ -67,20 +67,21 @@ class RunProgress:
         elif bilevel.scoring.objective.meaning:
             verdict += f": {bilevel.scoring.objective.meaning}"
         # The user must type the names of plugins: no name in a file is imported.
-        agents = [registry.name_of("agent", agent) for agent in self._config.agents.values()]
+        agents = {k: registry.name_of("agent", x) for k, x in self._config.agents.items()}
+        is_own = any(":" in name for name in agents.values())
         env, proxy = to_plain(self._config.env, "env"), self._config.name("proxy")
-        named = {"env": env["name"], "proxy_kind": proxy, "agents": f"[{','.join(agents)}]"}
-        named["exploration"] = self._config.name("exploration")
-        typed = [shlex.quote(f"{name}={text}") for name, text in named.items() if ":" in text]
-        words = "".join(f" {word}" for word in typed)
-        words += " agent_hparams=as_learned" if ":" in named["agents"] else ""
+        named = [("env", env["name"]), ("proxy_kind", proxy)]
+        named += [("exploration", self._config.name("exploration"))]
+        typed = [f"{name}={text}" for name, text in named if ":" in text]
+        typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
+        typed += ["agent_hparams=as_learned"] * is_own
+        words = "".join(f" {shlex.quote(word)}" for word in typed)
         texts = {name: repr(value) for name, value in env.items()}
         texts |= {k: f"float('{x}')" for k, x in env.items() if x in (np.inf, -np.inf)}
         fields = ", ".join(f"{name}={text}" for name, text in texts.items())
         arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
-        if ":" in proxy:
-            choice = to_plain(self._config.proxy, "proxy")
-            arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})"
+        choice = to_plain(self._config.proxy, "proxy")
+        arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})" * (":" in proxy)
         self.say(
             f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'finished'}\n"
             f"{verdict}\n\n"
