@@ -267,6 +267,6 @@ def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None
     shape = (strategy.population_size, mean.size)
     require(asked.shape == shape, "es", f"must ask for candidates {shape}", got=asked.shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
-    require(least >= 1, "es", "must evaluate each candidate and the incumbent", got=least)
+    require(least > 0, "es", "must evaluate each candidate and the incumbent", got=least)
     is_paired = not strategy.antithetic or shape[0] % 2 == 0
     require(is_paired, "es", "must be even, as it is antithetic", got=shape[0])

@@ -6,6 +6,7 @@ one for each training. A mixture puts the first ones in one unit. An objective m
 another score (`Objective.shown`), as `MaxReward.first_eval_steps` does.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -100,7 +101,7 @@ class Scoring:
         """Trainings on the incumbent, rounded up to equally many with each agent."""
         return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
 
-    @property
+    @functools.cached_property
     def candidates_of(self) -> tuple[np.ndarray, ...]:
         """For each agent, the numbers of the candidates that it trains on.
 

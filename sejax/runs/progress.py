@@ -68,11 +68,10 @@ class RunProgress:
             verdict += f": {bilevel.scoring.objective.meaning}"
         # The user must type the names of plugins: no name in a file is imported.
         agents = {k: registry.name_of("agent", x) for k, x in self._config.agents.items()}
-        is_own = any(":" in name for name in agents.values())
-        env, proxy = to_plain(self._config.env, "env"), self._config.name("proxy")
-        named = [("env", env["name"]), ("proxy_kind", proxy)]
-        named += [("exploration", self._config.name("exploration"))]
-        typed = [f"{name}={text}" for name, text in named if ":" in text]
+        is_own, proxy = any(":" in x for x in agents.values()), self._config.name("proxy")
+        env, explored = to_plain(self._config.env, "env"), self._config.name("exploration")
+        named = {"env": env["name"], "proxy_kind": proxy, "exploration": explored}
+        typed = [f"{name}={text}" for name, text in named.items() if ":" in text]
         typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
         typed += ["agent_hparams=as_learned"] * is_own
         words = "".join(f" {shlex.quote(word)}" for word in typed)
