@@ -26,7 +26,7 @@ from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
 from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import ConfigError, Count, option, registry, require
-from sejax.options.plain import configure, flatten
+from sejax.options.plain import configure, flatten, merge, to_plain
 from sejax.proxies import header, hub
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs import commands, compose, runtime
@@ -101,9 +101,11 @@ class EvaluateConfig(CommandConfig):
           ConfigError: without a proxy; for agents of the proxy that are neither registered nor
             typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
         """
-        fix = "Set proxy=RUN_DIR, FILE, cartpole, or real."
-        require("proxy" in typed, "proxy", "must be given", fix=fix)
-        is_used = "training" not in typed or typed.get("training_from") == "config"
+        require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE, cartpole, or real")
+        # As --print-config has it, whose output may come as preset=FILE.yaml.
+        printed = to_plain(TrainingConfig())
+        is_default = merge({"training": printed}, typed)["training"] == printed
+        is_used = is_default or typed.get("training_from") == "config"
         require(is_used, "training", "must come with training_from=config, or be real_training.*.")
         names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
         is_learned = hparams == "as_learned" or (not names and hparams is None)

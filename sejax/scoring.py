@@ -143,9 +143,9 @@ class Scoring:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
         scores = self._scores(self.objective(outcome))
-        by_candidate = scores.population.reshape(-1, self.strategy.num_evals)
+        # nan if the agent of one evaluation diverged
         aggregate = jnp.mean if self.strategy.eval_aggregate == "mean" else jnp.min
-        population = aggregate(by_candidate, axis=1)  # nan if the agent of one diverged
+        population = aggregate(scores.population.reshape(-1, self.strategy.num_evals), axis=1)
         return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
 
     def shown(self, outcome: Outcome) -> Scores:

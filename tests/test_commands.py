@@ -112,8 +112,7 @@ def test_a_platform_that_jax_lacks_is_one_line_with_the_variable(tmp_path):
 
 
 def test_64_bits_are_refused_with_one_line():
-    with jax.enable_x64(True):
-        error = refusal(runtime.configure_jax)
+    error = jax.enable_x64(True)(refusal)(runtime.configure_jax)
     assert error.field == "jax_enable_x64" and "Set JAX_ENABLE_X64=false." in str(error)
 
 

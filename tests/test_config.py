@@ -114,7 +114,10 @@ def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
         sejax.save(tmp_path / "x.safetensors", env, params.weights, config, 0.8)
         proxy = sejax.load_proxy(tmp_path / "x.safetensors")
         assert (sejax.agent_of(proxy).varied is not None) == (hparams == "varied")
-        worlds, _ = evaluate.setup_of(evaluation([f"proxy={proxy.path}"]))
+        config = evaluation([f"proxy={proxy.path}"])
+        (tmp_path / "printed.yaml").write_text(yaml.safe_dump(config.plain()))
+        assert evaluation([f"preset={tmp_path}/printed.yaml"]) == config
+        worlds, _ = evaluate.setup_of(config)
         assert {world.is_varied for world in worlds.values()} == {hparams == "varied"}
 
 

@@ -113,8 +113,7 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
         assert budget_for(training, agent, learned_with, length).max_steps == budget
     # Of one step each: as many episodes more.
     assert budget_for(training, long, [then], 1).max_episodes == training.max_episodes + 401
-    unlimited = paper_training()
-    assert budget_for(unlimited, PPOConfig(), [then], 200) == unlimited
+    assert budget_for(paper_training(), PPOConfig(), [then], 200) == paper_training()
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
