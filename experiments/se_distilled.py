@@ -71,7 +71,7 @@ def compute(settings: SeDistilled) -> pd.DataFrame:
 
 def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
     """Rows of the command with one seed, a cached shard."""
-    config = distill.config_of(settings.words(seed))
+    config = distill.DistillConfig.of_words(settings.words(seed))
     folder = settings.work_folder / f"seed{seed}"
     config = dataclasses.replace(config, devices=settings.devices, run_dir=str(folder))
 
@@ -131,7 +131,7 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
             for x in mine.itertuples()
         }
         shown.append(costs | cells)
-    config = distill.config_of(settings.words(settings.seed))
+    config = distill.DistillConfig.of_words(settings.words(settings.seed))
     search = config.search
     note = (
         f"Each row is a run of `python -m sejax.distill`: {search.num_starts} searches begin with "

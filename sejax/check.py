@@ -35,7 +35,6 @@ from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted
 from sejax.envs.base import Task
-from sejax.evaluate import EvaluateConfig, World, loaded, print_table, setup_of, summarise, train
 from sejax.myopia import ENOUGH, Judgement, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.ops.scores import reaches
@@ -44,10 +43,11 @@ from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
-from sejax.runs import commands, compose, plots, runtime
+from sejax.runs import commands, compose, fresh_agents, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.chunks import Pool
 from sejax.runs.config import REAL_TRAINING, MachinesConfig
+from sejax.runs.fresh_agents import FreshAgentsConfig, World
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
@@ -65,7 +65,7 @@ Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckConfig(EvaluateConfig):
+class CheckConfig(FreshAgentsConfig):
     """What `sejax.check` takes.
 
     Attributes:
@@ -83,6 +83,11 @@ class CheckConfig(EvaluateConfig):
     num_agents: Annotated[int, Field(ge=ENOUGH, le=LARGEST)] = 20
     agent_hparams: Literal["default", "as_learned"] = "default"
     real_training: TrainingConfig = dataclasses.replace(REAL_TRAINING, max_steps=20_000)
+
+    @property
+    def default_folder(self) -> str:
+        """The folder, named by the proxy."""
+        return f"runs/check-{as_file_name(self.proxy.removesuffix('.safetensors'))}"
 
 
 # --- the command ----------------------------------------------------------------------------------
@@ -129,19 +134,17 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     students = learned | others
     for of_discount in myopic.values():
         students |= of_discount
-    worlds = setup_of(dataclasses.replace(config, agents=students))[0].values()
+    worlds = fresh_agents.worlds_of(dataclasses.replace(config, agents=students)).values()
     on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
     on_task.trainings[tuned] = config.real_training
     config = dataclasses.replace(config, agents=students | {tuned: _tuned(task)})
-    name = as_file_name(config.proxy.removesuffix(".safetensors"))
-    folder = Path(config.out_dir or f"runs/check-{name}")
     settings = config.plain() | {"task": task.origin, "discount": proxy.discount}
     settings["proxy"] = {"weights": proxy.fingerprint} | to_plain(proxy.env.config, "proxy")
     settings["trainings"] = to_plain(on_proxy.trainings)
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
-    store = Store(folder, settings, field="out_dir", free=FREE)
+    store = Store(config.folder, settings, field="out_dir", free=FREE)
     with store, config.machines.pool() as pool:
         store.once("check", dict)  # settings are compared, whatever `num_agents` is
         table, null = _trained(config, rows, store, pool), dict[str, Any]()
@@ -154,18 +157,17 @@ def findings(config: CheckConfig) -> dict[str, Any]:
         rows[TUNED] = on_task, [tuned]
         rows[NOTHING] = _of_lengths(on_task, dict.fromkeys(learned, 1)), [*learned][:1]
         table = pd.concat([table, _trained(config, rows, store, pool)], ignore_index=True)
-        return _reported(proxy, null, [*learned], table, folder)
+        return _reported(proxy, null, [*learned], table, config.folder)
 
 
 def _judgeable(config: CheckConfig) -> Proxy:
     """The proxy, if all that a check needs is there; else it raises `ConfigError`."""
     require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
-    proxy = loaded(config)
+    proxy = fresh_agents.loaded(config)
     task = proxy.task
     is_idle = proxy.env.is_real and config.training_from != "proxy"
     require(not is_idle, "training_from", "must be left out for an RN. Set real_training.*.")
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
-    require(config.baseline, "baseline", "must be true, to compare with the task. Leave it out.")
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
     have_one = all(hasattr(agent, "discount") for agent in config.agents.values())
     require(have_one, "agent", "must have a discount", got=", ".join(config.agents), use="NAME")
@@ -261,7 +263,7 @@ def _trained(config: CheckConfig, rows: Rows, store: Store, pool: Pool) -> pd.Da
         names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
         missing = [key for key, name in names.items() if store.get(name) is None]
         print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
-        results = iter(pool(train, [(config, world, key) for key in missing]))
+        results = iter(pool(fresh_agents.train, [(config, world, key) for key in missing]))
         for key, name in names.items():
             columns = store.once(name, functools.partial(next, results))
             tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
@@ -277,7 +279,7 @@ def _reported(
     """Prints and writes the findings."""
     task, is_rn = proxy.task, proxy.env.is_real
     table = _scored(table, task, is_rn)
-    summary = summarise(table, ["world"])
+    summary = fresh_agents.summarise(table, ["world"])
     judgements = _judgements(table, learned, task, is_rn)
     teaches = "its reward teaches" if is_rn else "its dynamics teach"  # an RN's are the task's
     verdict = verdict_of(judgements.values(), teaches)
@@ -288,7 +290,7 @@ def _reported(
     shares = shares.reset_index("agent")
     solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     shown = summary.set_index(solved[summary.index], append=True)
-    print_table(shown, title, yaml.safe_dump(printed, sort_keys=False).strip(), SHOWN)
+    fresh_agents.print_table(shown, title, yaml.safe_dump(printed, sort_keys=False).strip(), SHOWN)
     found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
     found["worlds"] = summary.assign(solved=solved).to_dict("index")
     write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")

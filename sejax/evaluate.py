@@ -8,155 +8,49 @@ By default they are the agents that the proxy was learned with; agent=NAME takes
 Writes evaluation.csv and .json into out_dir. --print-config prints the configuration alone.
 """
 
-import contextlib
 import dataclasses
 import itertools
 import json
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
 
-import jax
 import pandas as pd
 
-from sejax import agents, envs
-from sejax.agents import AgentConfig
-from sejax.evaluation import evaluate_agents
 from sejax.ops.files import as_file_name, require_writable, write_text
-from sejax.options import ConfigError, Count, option, registry, require
-from sejax.options.plain import configure, flatten, merge, to_plain
 from sejax.proxies import header, hub
-from sejax.proxies.io import Proxy, load_proxy, training_of
-from sejax.runs import commands, compose, runtime
+from sejax.runs import commands, fresh_agents, runtime
 from sejax.runs import config as configuration
-from sejax.runs.compose import Tree
-from sejax.runs.config import REAL_TRAINING, CommandConfig, default_agent
-from sejax.training import TrainingConfig
-
-# Columns of the table: what they show, and with how many digits.
-SHOWN = {
-    "return": ("test_return", 1),
-    "training steps": ("train_steps", 0),
-    "training episodes": ("train_episodes", 1),
-}
-
-
-class World(NamedTuple):
-    """An environment, its params, the real task of the tests, and training limits by agent key."""
-
-    env: Any
-    params: Any
-    task: envs.Task
-    trainings: dict[str, TrainingConfig]
-    is_varied: bool = False  # whether hyperparameters are random for each agent
+from sejax.runs.fresh_agents import FreshAgentsConfig, World
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(CommandConfig):
+class EvaluateConfig(FreshAgentsConfig):
     """What `sejax.evaluate` takes.
 
     Attributes:
-      proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
-      env: the task, if proxy=real or if the proxy's task is your own
-      proxy_kind: my_module:MyProxy, if the proxy's class is your own
-      agent_hparams: as_learned: agents and exploration that the proxy was learned with, if no
-        agent is named; default: the agent's; varied: drawn around the default for each agent.
-      training_from: How long agents train on the proxy. proxy: on an SE as in the run that learned
-        it, on a reward network as on the real task; config: as `training` says.
       baseline: whether as many agents train on the real task, for comparison
       out_dir: null: beside the proxy; of a sweep, and if the proxy has no folder,
         runs/evaluate-<proxy>
-      real_training: Training on the real task. Its test_episodes hold on the proxy too, unless
-        training_from=config. Agents as_learned keep the time_limit_is_terminal of the run.
     """
 
-    proxy: str
-    env: str | None = option(None, names_code=True)
-    proxy_kind: str | None = option(None, names_code=True)
-    agent_hparams: Literal["default", "varied", "as_learned"] = "default"
-    training_from: Literal["proxy", "config"] = "proxy"
-    num_agents: Count = 10
+    named_by = ("proxy",)
+
     baseline: bool = True
-    out_dir: str | None = None
-    real_training: TrainingConfig = REAL_TRAINING
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
-            is_idle = self.proxy == "real" and getattr(self, name) == idle
-            require(not is_idle, name, "must be left out with proxy=real", got=idle)
+    @property
+    def default_folder(self) -> str:
+        """The folder of sweeps, of a shipped proxy or one of the Hub, and on the real task."""
+        is_real, proxy = self.proxy == "real", self.proxy.removeprefix(hub.SCHEME)
+        return f"runs/evaluate-{as_file_name(f'real-{self.env}' if is_real else proxy)}"
 
-    @classmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
-        """What agents take from the run that learned the proxy.
-
-        If no word names an agent, all of the proxy's agents train, with their exploration and the
-        run's `time_limit_is_terminal`; typed fields lie over theirs. A typed agent that the proxy
-        was learned with has the proxy's hyperparameters. If the file has no agents, the task's
-        default one trains.
-
-        Raises:
-          ConfigError: without a proxy; for agents of the proxy that are neither registered nor
-            typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
-        """
-        require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE, cartpole, or real")
-        # As --print-config has it, whose output may come as preset=FILE.yaml.
-        printed = to_plain(TrainingConfig())
-        is_default = merge({"training": printed}, typed)["training"] == printed
-        is_used = is_default or typed.get("training_from") == "config"
-        require(is_used, "training", "must come with training_from=config, or be real_training.*.")
-        names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
-        is_learned = hparams == "as_learned" or (not names and hparams is None)
-        stored, learned, default = None, Tree(), ""
-        with contextlib.suppress(ConfigError):  # loading the proxy raises it later
-            if typed["proxy"] != "real":
-                stored = header.read(str(typed["proxy"]), "proxy").header
-                default = agents.default_for(stored.spec)
-        if stored:
-            learned = agents_in(stored.config, imports, is_learned)
-            if hparams == "as_learned":
-                require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-                are_same = names in ({}, compose.names_of(stored.config["agents"]))
-                fix = "Set agent_hparams=default."
-                require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
-        if learned and is_learned:
-            stored_name = learned["exploration"]["name"]
-            if typed.get("exploration", {}).get("name", stored_name) != stored_name:
-                del learned["exploration"]
-            return {"proxy": learned | {"agent_hparams": "as_learned"}}
-        default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)
-        names = names or {default: default}
-        known = learned.get("agents", {}) if hparams is None else {}
-        chosen = Tree()
-        for key, name in names.items():
-            same = {k: agent for k, agent in known.items() if agent["name"] == name}
-            chosen[key] = same.get(key) or next(iter(same.values()), {"name": name})
-        return {"proxy": {"agents": chosen}}
-
-
-def agents_in(config: Mapping[str, Any], imports: Collection[str], is_learned: bool) -> Tree:
-    """What a stored configuration says of its agents; empty if one is not known.
-
-    Args:
-      config: of a proxy's file.
-      imports: each `module:attribute` that the user has typed.
-      is_learned: whether these agents are to train.
-
-    Raises:
-      ConfigError: if one that is to train is neither registered nor typed.
-    """
-    explored = config.get("exploration", {"name": "none"})
-    named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
-    unknown = [(group, x) for group, x in named if not header.is_registered(group, x)]
-    for group, x in unknown:
-        registry.require_typed(group, str(x.get("name")), imports if is_learned else None)
-    if not config["agents"] or any(x.get("name") not in imports for _, x in unknown):
-        return {}
-    limit = flatten(config).get("training.time_limit_is_terminal", True)
-    real_training = {"time_limit_is_terminal": limit}
-    return {"agents": config["agents"], "exploration": explored, "real_training": real_training}
+    @property
+    def folder(self) -> Path:
+        """`out_dir`; by default that of the proxy, if it has one."""
+        if self.out_dir or self.proxy == "real" or hub.is_address(self.proxy):
+            return super().folder
+        beside = header.find(self.proxy, "proxy").parent
+        return super().folder if beside == header.PRETRAINED_DIR else beside
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -179,20 +73,10 @@ def help_text(overrides: Sequence[str]) -> str:
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
-    configs = compose.swept(overrides, EvaluateConfig.of_words, "out_dir", _folder_of, ("proxy",))
-    if len(configs) == 1:
-        return configs
-    configs = [dataclasses.replace(x, out_dir=x.out_dir or _folder_of(x)) for x in configs]
-    are_apart = len({x.out_dir for x in configs}) == len({str(x) for x in configs})
-    require(are_apart, "out_dir", "must differ for each evaluation. Set proxy to one of them.")
-    return configs
-
-
-def _folder_of(config: EvaluateConfig, name: str = "") -> str:
-    """The default folder on the real task, of a shipped proxy or one of the Hub, and in sweeps."""
-    is_real, proxy = config.proxy == "real", config.proxy.removeprefix(hub.SCHEME)
-    folder = f"runs/evaluate-{as_file_name(f'real-{config.env}' if is_real else proxy)}"
-    return f"{folder}_{name}" if name else folder
+    configs = EvaluateConfig.of_sweep(overrides)
+    if len(configs) > 1:
+        configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
+    return configuration.apart(configs)
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -205,147 +89,33 @@ def evaluate(config: EvaluateConfig) -> float:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
         cannot be written.
     """
-    worlds, out_dir = setup_of(config)
+    worlds, out_dir = fresh_agents.worlds_of(config), config.folder
+    if not config.baseline:
+        worlds = dict([*worlds.items()][:1])
     require_writable("out_dir", out_dir)  # before agents train for nothing
     pairs = itertools.product(worlds, config.agents)
     table = pd.concat([_train_and_test(config, x, worlds[x], key) for x, key in pairs])
-    summary = summarise(table, ["world", "agent"] if len(config.agents) > 1 else ["world"])
+    summary = fresh_agents.summarise(table, ["world", "agent"])
     (key, *others), (name, world) = config.agents, next(iter(worlds.items()))
     who = "agents of each algorithm" if others else f"{key} agents"
     solved = f" (solved at {world.task.solved_reward:g})" if world.task.is_solvable else ""
     title = f"{config.num_agents} fresh {who}, tested on {world.task.name}{solved}"
-    print_table(summary, title, f"{out_dir}/evaluation.csv holds every agent.")
+    shown = summary if others else summary.droplevel("agent")
+    fresh_agents.print_table(shown, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
-    text = str(summary.to_json(orient="index", indent=2))
-    if others:  # an object for each world, and in it one for each agent
-        of_worlds = {world: summary.loc[world].to_json(orient="index") for world in worlds}
-        text = json.dumps({world: json.loads(x) for world, x in of_worlds.items()}, indent=2)
-    write_text(out_dir / "evaluation.json", text)
+    texts = {world: summary.loc[world].to_json(orient="index") for world in worlds}
+    by_world = {world: json.loads(text) for world, text in texts.items()}
+    write_text(out_dir / "evaluation.json", json.dumps(by_world, indent=2))
     return float(summary["test_return_mean"].loc[name].mean())
 
 
-def setup_of(config: EvaluateConfig) -> tuple[dict[str, World], Path]:
-    """Where the agents of an evaluation train: on the proxy, and others on its real task.
-
-    Returns:
-      The worlds by name, in the order of tables; and the folder for the files.
-
-    Raises:
-      ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or agents that
-        do not fit it.
-    """
-    is_given = config.proxy != "real" or config.env
-    require(is_given, "env", "must be given with proxy=real. Set env=cartpole.")
-    proxy = None if config.proxy == "real" else loaded(config)
-    task = envs.make(str(config.env)) if proxy is None else proxy.task
-    real_training, trainings = config.real_training, {}
-    for key, agent in config.agents.items():
-        agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
-        group, training = "real_training", real_training
-        if config.training_from == "config":
-            group, training = "training", config.training
-        elif proxy is not None and not proxy.env.is_real:  # RNs: as on the real task
-            group, training = "training", _as_learned(proxy, config, agent)
-        if proxy is not None:
-            config.require_learning(key, group, training, proxy.env.config, task)
-        trainings[key] = training
-    is_varied = config.agent_hparams == "varied"
-    if proxy is not None and config.agent_hparams == "as_learned":
-        is_varied = proxy.config.get("agent_hparams") == "varied"
-    worlds, folder = {}, Path(_folder_of(config))
-    if proxy is not None:
-        worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
-        if proxy.path.parent != header.PRETRAINED_DIR and not hub.is_address(config.proxy):
-            folder = proxy.path.parent
-    if proxy is None or config.baseline:
-        trainings = dict.fromkeys(trainings, real_training)
-        worlds["the real task"] = World(task.env, task.params, task, trainings, is_varied)
-    return worlds, Path(config.out_dir or folder)
-
-
-def loaded(config: EvaluateConfig) -> Proxy:
-    """Loads the proxy. Imports modules that the command line names, never those that a file names.
-
-    Raises:
-      ConfigError: if it cannot be loaded, or `env` is not its task.
-    """
-    path, _, learned = header.read(config.proxy, "proxy")
-    stored = learned.config
-    task = proxy_config = None
-    if config.env is not None and not registry.is_registered("env", config.env):
-        fields = stored["env"] if stored["env"].get("name") == config.env else {}
-        task = envs.make_from(configure("env", {**fields, "name": config.env}))
-    if config.proxy_kind is not None:
-        proxy_config = configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
-    proxy = load_proxy(path, task, proxy_config, "proxy")
-    name = proxy.task.name
-    is_same = config.env in (None, name, proxy.config["env"].get("name"))
-    require(is_same, "env", "must be the proxy's own task", got=config.env, use=name)
-    return proxy
-
-
-def _as_learned(proxy: Proxy, config: EvaluateConfig, agent: AgentConfig) -> TrainingConfig:
-    """How long agents train on an SE, by the SE's file."""
-    use = "config training.max_steps=2000 training.max_episodes=2000"
-    require("training" in proxy.config, "training_from", "must be config for this SE", use=use)
-    test_episodes = config.real_training.test_episodes
-    return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
-
-
 def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -> pd.DataFrame:
-    """A row for each agent of an algorithm; `agent` is its number, of several its key."""
+    """A row for each agent of an algorithm, whose key is `agent`."""
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     print(f"training {config.num_agents:,} {who} on {name} ...", flush=True)
-    columns = train(config, world, key)
-    numbers: dict[str, Any] = {"agent": range(config.num_agents)}
-    if len(config.agents) > 1:
-        numbers = {"agent": key, "number": range(config.num_agents)}
-    return pd.DataFrame({**numbers, **columns, "world": name})
-
-
-def train(config: EvaluateConfig, world: World, key: str) -> dict[str, Any]:
-    """The results of fresh agents in a world: arrays `[agent]` by column of the table."""
-    env, env_params, task, trainings, is_varied = world
-    agent = config.agent_for(key, task, is_varied)
-    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    how = trainings[key], keys, config.num_parallel, config.devices
-    outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))
-    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # one for each agent
-    varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
-    return {"test_return": outcome.test_return, **of_agents, **varied}
-
-
-def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Mean and standard deviation of each column for each group.
-
-    An agent that diverged counts with the worst return of all agents.
-    """
-    returns = table["test_return"].mask(table["nonfinite"] > 0)
-    table = table.assign(test_return=returns.fillna(returns.min()))
-    grouped = table.groupby(by, sort=False)
-    summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
-    summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
-    return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
-
-
-def spread(mean: float, std: float, digits: int) -> str:
-    """Mean and deviation as text; one agent has no deviation."""
-    return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
-
-
-def print_table(
-    summary: pd.DataFrame, title: str, last: str, shown: Mapping[str, tuple[str, int]] = SHOWN
-) -> None:
-    """Prints what `summarise` returns, a row for each group, and a last line below."""
-    columns = {}
-    for label, (name, digits) in shown.items():
-        pairs = zip(summary[f"{name}_mean"], summary[f"{name}_std"], strict=True)
-        columns[label] = [spread(mean, std, digits) for mean, std in pairs]
-    table = pd.DataFrame(columns, summary.index).rename_axis([None] * summary.index.nlevels)
-    print(f"{title}\n\n{table.rename_axis(columns='trained on').to_string(sparsify=False)}\n")
-    if diverged := int(summary["num_nonfinite"].sum()):
-        print(f"{diverged} agents met a number that is not finite.")
-    print(last)
+    columns = fresh_agents.train(config, world, key)
+    numbers = range(config.num_agents)
+    return pd.DataFrame({"agent": key, "number": numbers, **columns, "world": name})
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ import dataclasses
 from collections.abc import Sequence
 
 from sejax.bilevel import make_bilevel
-from sejax.options import FailedError, require
-from sejax.runs import commands, compose, runtime, session
+from sejax.options import FailedError
+from sejax.runs import commands, runtime, session
 from sejax.runs import config as configuration
-from sejax.runs.config import IN_RUN_DIR, LearnConfig
+from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
 
@@ -41,21 +41,13 @@ def help_text(overrides: Sequence[str]) -> str:
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     """The configuration of each run that the overrides describe, with folders of their own."""
-
-    def folder_of(config: LearnConfig, name: str) -> str:
-        return f"{config.resolved_run_dir}_{name}"
-
-    configs = compose.swept(overrides, LearnConfig.of_words, "run_dir", folder_of, IN_RUN_DIR)
     runs: list[LearnConfig] = []
-    for config in configs:
+    for config in LearnConfig.of_sweep(overrides):
         for seed in range(config.seed, config.seed + config.num_seeds):
             is_alone, folder = config.num_seeds == 1, config.run_dir
             folder = folder if is_alone else folder and f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    by_folder = {str(run.resolved_run_dir): run for run in runs}
-    must, got = "must differ for each run in letters or digits", next(iter(by_folder), "")
-    require(len(by_folder) == len({str(run) for run in runs}), "run_dir", must, got=got)
-    return [*by_folder.values()]
+    return configuration.apart(runs)
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -103,7 +95,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     if len(configs) > 1:
         print("Best scores of the search mean:")
         for config, score in zip(configs, scores, strict=True):
-            print(f"{score:10.1f}  {config.resolved_run_dir}")
+            print(f"{score:10.1f}  {config.folder}")
     if diverged:
         runs = ", ".join(map(str, diverged))
         what = f"All agents of {runs} diverged, or all on its search means: nothing was learned."

@@ -14,6 +14,7 @@ import sejax
 from sejax.myopia import Judgement, judge, verdict_of
 from sejax.ops.checksummed import pack, unpack
 from sejax.proxies.exact import make_exact
+from sejax.runs import fresh_agents
 
 checking = importlib.import_module("sejax.check")  # `sejax.check` is its function
 ROOM = ("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")
@@ -112,13 +113,13 @@ def test_a_check_has_a_row_for_each_comparison_and_writes_what_it_returns(whole,
 def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     folder, found = whole
     path, out = folder / "mine.safetensors", tmp_path / "out"
-    calls, train = [], checking.train
+    calls, train = [], fresh_agents.train
 
     def dies(*job):
         calls.append(job)
         return refuse() if len(calls) == 3 else train(*job)
 
-    monkeypatch.setattr(checking, "train", dies)
+    monkeypatch.setattr(fresh_agents, "train", dies)
     with pytest.raises(AssertionError):
         run(path, out_dir=out)
     assert run(path, out_dir=out) == found and len(calls) == 1 + 8
@@ -156,8 +157,8 @@ def test_what_cannot_be_judged_is_refused(fields, field, whole, tmp_path, monkey
 
 def test_no_agents_have_random_hyperparameters(tmp_path, monkeypatch):
     """A discount of 0 would be drawn again, and rows would compare different agents."""
-    worlds, train = [], checking.train
-    monkeypatch.setattr(checking, "train", lambda *x: worlds.append(x[1]) or train(*x))
+    worlds, train = [], fresh_agents.train
+    monkeypatch.setattr(fresh_agents, "train", lambda *x: worlds.append(x[1]) or train(*x))
     run(save(tmp_path / "x.safetensors", *WHOLE, "agent_hparams=varied"), out_dir=tmp_path / "out")
     assert worlds and not any(world.is_varied for world in worlds)
 

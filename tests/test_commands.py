@@ -118,7 +118,7 @@ def test_64_bits_are_refused_with_one_line():
 
 def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
-    assert sejax.config(["run_dir=~/a"]).resolved_run_dir == Path("/home/me/a")
+    assert sejax.config(["run_dir=~/a"]).folder == Path("/home/me/a")
     assert expanded("sqlite:///~/a.db") == "sqlite:////home/me/a.db"
     assert all(expanded(text) == text for text in ("a~", "~me/a", "/a/~/b", "a:b"))
 

@@ -21,6 +21,7 @@ from sejax.runs import commands
 from sejax.runs import config as configuration
 from sejax.runs.compose import expand
 from sejax.runs.config import LearnConfig
+from sejax.runs.fresh_agents import worlds_of
 from sejax.runs.run_directory import RunDirectory
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic=ddqn", "agents.myopic.discount=0"]
@@ -62,7 +63,7 @@ def test_a_task_chooses_its_agent_and_a_proxy_its_objective():
     ("agents=[ppo,ddqn]", "runs/cartpole-se-ddqn+ppo-s0"),
 ])  # fmt: skip
 def test_the_run_directory_names_the_run(word, name):
-    assert str(sejax.config([word]).resolved_run_dir) == name
+    assert str(sejax.config([word]).folder) == name
 
 
 def test_values_are_read_by_the_types_of_their_fields():
@@ -117,8 +118,8 @@ def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
         config = evaluation([f"proxy={proxy.path}"])
         (tmp_path / "printed.yaml").write_text(yaml.safe_dump(config.plain()))
         assert evaluation([f"preset={tmp_path}/printed.yaml"]) == config
-        worlds, _ = evaluate.setup_of(config)
-        assert {world.is_varied for world in worlds.values()} == {hparams == "varied"}
+        worlds = worlds_of(config).values()
+        assert {world.is_varied for world in worlds} == {hparams == "varied"}
 
 
 def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():
@@ -143,12 +144,12 @@ def test_commas_outside_of_brackets_and_quotes_make_a_sweep():
 
 def test_the_runs_of_a_sweep_have_folders_of_their_own():
     configs = run.configs_of(["seed=0,1", "es.noise_std=0.03,0.06", "num_seeds=2"])
-    folders = {str(config.resolved_run_dir) for config in configs}
+    folders = {str(config.folder) for config in configs}
     assert len(folders) == 8 and all("noise_std" in folder for folder in folders)
     configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     configs = run.configs_of(["run_dir=", "seed=0,1"])  # an empty variable of a shell
-    assert {x.resolved_run_dir.name for x in configs} == {f"cartpole-se-ddqn-s{i}" for i in (0, 1)}
+    assert {x.folder.name for x in configs} == {f"cartpole-se-ddqn-s{i}" for i in (0, 1)}
     assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
     assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
     folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
@@ -277,7 +278,7 @@ def test_a_configuration_made_in_python_holds_configurations(part):
     ("proxy=cartpole agent.discount=0.5", "agent.discount"), ("proxy=real env.length=2", "env"),
     ("proxy=cartpole training.max_steps=2000", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
-    ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture"),
+    ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture.weights.ppo"),
 ])  # fmt: skip
 def test_what_evaluate_cannot_use_is_refused(override, field):
     assert refused(*override.split(), make=evaluation).field == field

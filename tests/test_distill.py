@@ -13,7 +13,7 @@ from support import refused
 
 import sejax
 from sejax.distill import policies, teaching
-from sejax.distill.__main__ import config_of, evaluations_of, main
+from sejax.distill.__main__ import DistillConfig, evaluations_of, main
 from sejax.proxies import header, zoo
 
 QUICK = (
@@ -180,19 +180,19 @@ def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
 
 def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
     (file := tmp_path / "x.yaml").write_text("{env: pendulum, agent: ppo, training.max_steps: 777}")
-    config = config_of([f"preset={file}"])
+    config = DistillConfig.of_words([f"preset={file}"])
     assert (*config.agents, config.training.max_steps) == ("ppo", 777)
     assert (config.preset, config.agent.rollout_steps) == ("distilled", 256)
     file.write_text("{env: pendulum, agent_hparams: varied}")  # which students have not
-    assert refused(config_of, [f"preset={file}"]) == "agent_hparams"
+    assert refused(DistillConfig.of_words, [f"preset={file}"]) == "agent_hparams"
 
 
 def test_defaults_are_those_of_the_task():
-    config = config_of(["env=hopper"])
+    config = DistillConfig.of_words(["env=hopper"])
     assert config.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
-    assert config_of(["env=hopper", "search.alive_bonus=0"]).search.alive_bonus == 0.0
-    assert config_of(["env=halfcheetah"]).search.alive_bonus == 0.0
-    config = config_of(["env=cartpole", "training.max_steps=700"])
+    assert DistillConfig.of_words(["env=hopper", "search.alive_bonus=0"]).search.alive_bonus == 0.0
+    assert DistillConfig.of_words(["env=halfcheetah"]).search.alive_bonus == 0.0
+    config = DistillConfig.of_words(["env=cartpole", "training.max_steps=700"])
     assert config.training.max_episodes == 700 and list(config.agents) == ["ddqn", "ppo"]
 
 
@@ -202,4 +202,4 @@ def test_defaults_are_those_of_the_task():
     (["policy=mine:act", "seed=2"], "distill-cartpole-mine-act-s2"),
 ])  # fmt: skip
 def test_the_default_folder_tells_policies_apart(words, name):
-    assert config_of(["env=cartpole", *words]).resolved_run_dir.name == name
+    assert DistillConfig.of_words(["env=cartpole", *words]).folder.name == name

@@ -16,10 +16,11 @@ from support import evaluation, paper_ppo, paper_se, paper_training, refusal, re
 import sejax
 from sejax import envs
 from sejax.agents.ppo import PPOConfig
-from sejax.evaluate import evaluate, setup_of, summarise
+from sejax.evaluate import evaluate
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.options.plain import configure, to_plain
+from sejax.runs.fresh_agents import summarise, worlds_of
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
 SE = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", "proxy.done=soft",
@@ -78,12 +79,15 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
     assert "2 fresh agents of each algorithm" in printed and printed.count("sarsa") == 4
 
 
-def test_one_agent_has_no_deviation(tmp_path, capsys):
-    words = "proxy=real", "env=gridworld_2x2", *ROOM, "num_agents=1", f"out_dir={tmp_path}"
-    evaluate(evaluate_config(*words))
+@pytest.mark.parametrize("world", ["the proxy", "the real task"])
+def test_one_agent_in_one_world_has_no_deviation(world, room, tmp_path, capsys):
+    is_real, where = world == "the real task", f"out_dir={tmp_path}"
+    words = "proxy=real env=gridworld_2x2" if is_real else f"proxy={room} baseline=false"
+    evaluate(evaluate_config(*words.split(), *ROOM, "num_agents=1", where))
     printed = capsys.readouterr().out
     assert "nan" not in printed and "1 fresh q_learning agents" in printed
-    assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
+    (row,) = pd.read_csv(tmp_path / "evaluation.csv").to_dict("records")
+    assert (row["world"], row["agent"]) == (world, "q_learning")
 
 
 OwnPPO = type("OwnPPO", (PPOConfig,), {})  # which is not registered
@@ -121,7 +125,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     words = ("agents=[ddqn,ppo]", "agents.ddqn.warmup_episodes=2", "agents.ppo.rollout_steps=100",
              "proxy.hidden_size=4", "training.max_steps=4000", *SE[3:])  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    worlds, _ = setup_of(evaluate_config(
+    worlds = worlds_of(evaluate_config(
         f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]", "agents.dueling_ddqn.warmup_episodes=10",
         "agents.ppo.rollout_steps=null"))  # fmt: skip
     budgets = {key: x.max_steps for key, x in worlds["the proxy"].trainings.items()}
@@ -130,7 +134,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
     assert as_learned.agents == learned(*words)[0].agents
-    assert setup_of(as_learned)[0]["the proxy"].trainings["ppo"].max_steps == 4000
+    assert worlds_of(as_learned)["the proxy"].trainings["ppo"].max_steps == 4000
 
 
 @pytest.mark.parametrize(("proxy", "words", "field"), [
@@ -161,7 +165,7 @@ def test_what_cannot_be_trained_is_refused_before_anything_starts(
 def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(word, expected, tmp_path):
     """They do not bootstrap there; on the real task beside the RN they do likewise; words win."""
     path = save(tmp_path / "proxy.safetensors", "env=mountain_car_continuous", "proxy=rn")
-    for world in setup_of(evaluate_config(f"proxy={path}", word))[0].values():
+    for world in worlds_of(evaluate_config(f"proxy={path}", word)).values():
         assert world.trainings["td3"].time_limit_is_terminal == expected
 
 
@@ -169,11 +173,11 @@ def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, 
     """Tests on the real task, by which agents there stop, are not for an SE."""
     proxies, bare = sejax.load_set(room), tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights)
-    words = f"proxy={bare}", "agent=q_learning", "baseline=false"
-    assert refused(setup_of, evaluate_config(*words)) == "training_from"
+    words = f"proxy={bare}", "agent=q_learning"
+    assert refused(worlds_of, evaluate_config(*words)) == "training_from"
     given = "training_from=config", "training.max_steps=7", "training.stop_rule=never"
-    ((name, world),) = setup_of(evaluate_config(*words, *given))[0].items()
-    assert name == "the proxy" and world.trainings["q_learning"].max_steps == 7
+    world = worlds_of(evaluate_config(*words, *given))["the proxy"]
+    assert world.trainings["q_learning"].max_steps == 7
 
 
 def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
@@ -181,7 +185,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path):
     words = "env=cliff_walking", "proxy=rn", "exploration=count_based", "exploration.count_power=2"
     path = save(tmp_path / "proxy.safetensors", *words)
     config = evaluate_config(f"proxy={path}", "agent_hparams=as_learned")
-    (worlds, _), learner = setup_of(config), learned(*words)[0]
+    worlds, learner = worlds_of(config), learned(*words)[0]
     assert (config.agents, config.exploration) == (learner.agents, learner.exploration)
     # Its dynamics are real.
     assert worlds["the proxy"].trainings == {"q_learning": config.real_training}
@@ -201,13 +205,8 @@ def test_agents_that_are_named_have_the_hyperparameters_of_the_run(tmp_path, mon
     path = save(tmp_path / "mixed.safetensors", *words)
     config = evaluate_config(f"proxy={path}", words[1])
     assert config.agents["typed_agent_Own"].tau == 0.03
-    words = [
-        "agents=[ddqn]",
-        "agents.tuned.name=ddqn",
-        "agents.tuned.tau=0.7",
-        "agents.ddqn.tau=0.2",
-    ]
-    path = save(tmp_path / "twice.safetensors", "env=cartpole", *words)
+    words = "agents=[ddqn] agents.tuned.name=ddqn agents.tuned.tau=0.7 agents.ddqn.tau=0.2"
+    path = save(tmp_path / "twice.safetensors", "env=cartpole", *words.split())
     assert evaluate_config(f"proxy={path}", "agent=ddqn").agent.tau == 0.2
 
 

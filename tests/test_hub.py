@@ -12,8 +12,8 @@ from safetensors.numpy import save
 from support import evaluation, paper_se, refusal, refused
 
 import sejax
-from sejax.evaluate import setup_of
 from sejax.proxies import header, hub
+from sejax.runs.fresh_agents import worlds_of
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
 
@@ -202,6 +202,6 @@ def test_what_cannot_be_read_or_written_is_one_message(the_hub, monkeypatch):
 
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     sejax.push("cartpole", "me/se")
-    worlds, out_dir = setup_of(evaluation(["proxy=hf://me/se@0"]))
-    assert str(out_dir) == "runs/evaluate-me_se_0"
-    assert {world.task.name for world in worlds.values()} == {"cartpole"}
+    config = evaluation(["proxy=hf://me/se@0"])
+    assert str(config.folder) == "runs/evaluate-me_se_0"
+    assert {world.task.name for world in worlds_of(config).values()} == {"cartpole"}

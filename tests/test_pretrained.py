@@ -11,10 +11,10 @@ import pytest
 from support import evaluation, refused
 
 import sejax
-from sejax.distill.__main__ import config_of
-from sejax.evaluate import setup_of
+from sejax.distill.__main__ import DistillConfig
 from sejax.options.plain import configure
 from sejax.proxies import header, zoo
+from sejax.runs.fresh_agents import worlds_of
 from tools import make_zoo, ship_proxy
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -40,7 +40,7 @@ def test_each_has_a_card_that_says_what_it_teaches_and_what_it_cost(proxy):
         assert learning.cpu_s > 0 and learning.train_steps > learning.agents
         assert learning.generations >= proxy.generation
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    worlds, _ = setup_of(evaluation(words.split()))
+    worlds = worlds_of(evaluation(words.split()))
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean)
     assert best.agent in worlds["the proxy"].trainings, "the command trains what did best"
 
@@ -50,7 +50,7 @@ def test_the_command_of_each_composes_what_its_file_was_learned_with(name):
     proxy, stored = PROXIES[name], sejax.load_proxy(name)
     words = shlex.split(proxy.learning.command)[3:]
     if proxy.policy_return is not None:
-        config = config_of(words)
+        config = DistillConfig.of_words(words)
         assert config.search.generations == proxy.learning.generations
         assert [x.agent for x in proxy.on_proxy] == list(stored.learned_agents())
     else:

@@ -119,10 +119,9 @@ def differing(words: list[str], config: Mapping[str, Any]) -> list[str]:
 
 def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Results of `python -m sejax.evaluate` on a proxy, as `zoo.Evaluation` has them."""
-    agents = args.agents.split(",")
     choice = [f"agents=[{args.agents}]" if "," in args.agents else f"agent={args.agents}"]
     if hparams == "as_learned":
-        agents, choice = list(sejax.load_proxy(path).learned_agents()), []
+        choice = []
     words = [f"proxy={path}", "num_agents=20", f"agent_hparams={hparams}", "baseline=false"]
     words += [f"out_dir={path.parent}", *choice, *args.overrides]
     subprocess.run([sys.executable, "-m", "sejax.evaluate", *words], check=True)
@@ -133,7 +132,7 @@ def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[st
         {"agent": agent, "hparams": hparams, "world": worlds[world]}
         | {name: row[column] for name, column in columns.items()}
         for world, rows in json.loads((path.parent / "evaluation.json").read_text()).items()
-        for agent, row in (rows if len(agents) > 1 else {agents[0]: rows}).items()
+        for agent, row in rows.items()
     ]
 
 

@@ -7,9 +7,8 @@
 
 A small network copies the policy and becomes the reward of a one-step SE. Without `policy`,
 augmented random search finds linear policies. The best policy of each part of the search becomes
-an SE, students train on each SE, and the SE that teaches best is kept. All other fields are those
-of sejax.run with preset=distilled. Writes proxy.safetensors, card.md, students.csv and search.csv
-into run_dir. The same command resumes where it stopped.
+an SE, students train on each SE, and the SE that teaches best is kept. Writes proxy.safetensors,
+card.md, students.csv and search.csv into run_dir. The same command resumes where it stopped.
 """
 
 import shlex
@@ -21,37 +20,42 @@ from typing import Any
 import jax
 import pandas as pd
 
-from sejax import envs
+from sejax import agents, envs
 from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, field_lines, option, require, shortened
-from sejax.options.plain import defaults_of, flatten, merge
+from sejax.options import Count, option, registry
+from sejax.options.plain import defaults_of, flatten, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
+from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import commands, compose, runtime
 from sejax.runs import config as configuration
 from sejax.runs.compose import Tree
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import CommandConfig, LearnConfig
 from sejax.runs.store import Store
 
-# Fields of sejax.run that have an effect here.
-USED = {"env", "agent", "agents", "exploration", "training", "preset", "seed", "devices", "run_dir"}
 # The default students and how many steps they train, by kind of actions.
 STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
 STEPS = {"continuous": 10_000, "discrete": 2000}
+ONE_STEP = SyntheticConfig()  # the form of the SEs
+FREE = ("run_dir", "devices", "num_parallel")  # fields that results do not depend on
 BEGUN = "begun"  # the entry of a search that may be unfinished
 CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
 CHOOSE, TEST = "choose", "test"  # what students are for
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillConfig(LearnConfig):
-    """Task, students and their trainings, as in a run, and how policies become SEs.
+class DistillConfig(CommandConfig):
+    """Task, students and their trainings, and how policies become SEs.
 
     Attributes:
+      env: the task to solve
+      preset: settings of agents and trainings
+      training: training of the students
+      run_dir: null: runs/distill-<env>[-<policy>]-s<seed>
       policy: ppo:FILE.zip, a model of Stable-Baselines3; module:function; or an agent of sejax,
         such as ppo. null: a linear policy is searched.
       copy: how a given policy is copied
@@ -64,6 +68,9 @@ class DistillConfig(LearnConfig):
       num_tested: Further students of each agent, on the chosen SE.
     """
 
+    env: registry.Makes[envs.Task] = plugin("env")
+    preset: str = "distilled"
+    run_dir: str | None = None
     policy: str | None = option(None, names_code=True)
     copy: CopyConfig = CopyConfig()
     search: PolicySearchConfig = PolicySearchConfig()
@@ -72,13 +79,22 @@ class DistillConfig(LearnConfig):
     num_students: Count = 4
     num_tested: Count = 10
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
+        for key, agent in self.agents.items():
+            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
+            self.require_learning(key, "training", self.training, ONE_STEP, spec)
+
     @classmethod
     def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
-        """The preset, which is `distilled`, and what depends on the task.
+        """The settings of a run with this preset that are fields here, and those of the task.
 
         One-step SEs have trainings and students of their own. Searches leave out the task's reward
         for being healthy.
         """
+        known = defaults_of(cls)
+        typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
         env = configuration.env_in(typed.get("env", {}), imports)
         actions = envs.spec_of(env).actions
         if not compose.names_of(typed["agents"]):
@@ -87,18 +103,17 @@ class DistillConfig(LearnConfig):
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
         lengths = {"max_steps": steps, "max_episodes": steps}
         search = {"alive_bonus": getattr(env, "healthy_reward", 0.0)}
-        below = super().layers_below({"preset": "distilled"} | typed, imports)
+        of_run = LearnConfig.layers_below(typed, imports)
+        below = {layer: {k: tree[k] for k in known if k in tree} for layer, tree in of_run.items()}
         return below | {"distill": {"training": lengths, "search": search}}
 
     @property
-    def resolved_run_dir(self) -> Path:
-        """The command's folder: `run_dir`, or one named by task, given policy and seed."""
+    def default_folder(self) -> str:
+        """The folder, named by task, given policy and seed."""
         algorithm, _, path = (self.policy or "").rpartition(":")
-        parts = ["distill", self.name("env"), algorithm, Path(path).stem, f"s{self.seed}"]
-        return Path(self.run_dir or f"runs/{as_file_name('-'.join(filter(None, parts)))}")
-
-
-OWN = defaults_of(DistillConfig).keys() - defaults_of(LearnConfig).keys()
+        task_name = registry.name_of("env", self.env)
+        parts = ["distill", task_name, algorithm, Path(path).stem, f"s{self.seed}"]
+        return f"runs/{as_file_name('-'.join(filter(None, parts)))}"
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -108,36 +123,18 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    config = config_of(overrides)
+    config = DistillConfig.of_words(overrides)
     runtime.configure_jax()
     try:
         distill(config, shlex.join(overrides))
     except KeyboardInterrupt as stop:
-        message = f"Interrupted. The same command resumes from {config.resolved_run_dir}."
+        message = f"Interrupted. The same command resumes from {config.folder}."
         commands.interrupted(message, stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    plain = flatten(config_of(overrides).plain())
-    values = {name: x for name, x in plain.items() if name.partition(".")[0] in OWN}
-    classes = [("", DistillConfig), ("copy", CopyConfig), ("search", PolicySearchConfig)]
-    return f"{__doc__}\nIts own fields, with their values:\n{field_lines(values, classes, {})}"
-
-
-def config_of(overrides: Sequence[str]) -> DistillConfig:
-    """The configuration of task, students and trainings.
-
-    Raises:
-      ConfigError: for invalid overrides.
-    """
-    for name in compose.words(overrides):
-        is_used = name.partition(".")[0] in {*USED, *OWN}
-        fix = "Set search.generations=N." if name == "generations" else "Leave it out."
-        require(is_used, shortened(name, 40), "has no effect here", fix=fix)
-    config = DistillConfig.of_words(overrides)
-    require(config.agent_hparams == "default", "agent_hparams", "has no effect here. Leave it out.")
-    return config
+    return f"{__doc__}\n{configuration.help_text(DistillConfig, overrides)}"
 
 
 # --- what the command does ------------------------------------------------------------------------
@@ -157,7 +154,7 @@ def distill(config: DistillConfig, words: str = "") -> Path:
       ConfigError: for a folder of another command, or an invalid policy.
       OSError: if a file cannot be written.
     """
-    with Store(config.resolved_run_dir, settings_of(config)) as store:
+    with Store(config.folder, settings_of(config)) as store:
         is_new = store.get(CHECKPOINT) is None  # raises for a folder of another command
         store.get(BEGUN)  # raises for other settings
         if is_new and (store.folder / "proxy.safetensors").exists():
@@ -166,7 +163,7 @@ def distill(config: DistillConfig, words: str = "") -> Path:
 
 
 def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
-    task, folder = config.task(), store.folder
+    task, folder = envs.make_from(config.env), store.folder
     # The last key also tests policies. The unused key "nothing" keeps the numbers of old runs.
     uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
@@ -202,8 +199,8 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     }
     record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
     record |= {"learning": learning, "policy_return": lesson.policy_return}
-    path, not_learned_with = folder / "proxy.safetensors", {"env", "proxy", *OWN}
-    learned_with = {k: x for k, x in config.plain().items() if k not in not_learned_with}
+    path, settings = folder / "proxy.safetensors", config.plain()
+    learned_with = {name: settings[name] for name in ("agents", "exploration", "training", "seed")}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path), str(folder)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
@@ -212,24 +209,20 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
 
 def settings_of(config: DistillConfig) -> dict[str, Any]:
     """The settings that the results depend on, as plain values."""
-    return {k: x for k, x in config.plain().items() if k not in ("run_dir", "devices")}
+    return {k: x for k, x in config.plain().items() if k not in FREE}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """The results of fresh students of each agent, in the form that the SE's file keeps."""
     rows = rows.assign(test_return=counted(rows["test_return"]))
-    return [
-        {
-            "agent": agent,
-            "hparams": "as_learned",
-            "world": "proxy",
-            "num_agents": len(students),
-            "return_mean": float(students["test_return"].mean()),
-            "return_std": float(students["test_return"].std(ddof=len(students) > 1)),
-            "train_steps": float(students["train_steps"].mean()),
-        }
-        for agent, students in rows.groupby("agent", sort=False)
-    ]
+    of_agents = rows.groupby("agent", sort=False).agg(
+        num_agents=("train_steps", "size"),
+        return_mean=("test_return", "mean"),
+        return_std=("test_return", "std"),
+        train_steps=("train_steps", "mean"),
+    )
+    fixed = {"hparams": "as_learned", "world": "proxy"}  # one student has no deviation
+    return [fixed | row for row in of_agents.fillna(0.0).reset_index().to_dict("records")]
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.io import fingerprint
-from sejax.runs.config import LearnConfig
+from sejax.runs.config import CommandConfig
 from sejax.runs.store import Store
 
 SE = tuple[ProxyEnv, PyTree]  # environment and weights
@@ -29,7 +29,7 @@ COLUMNS = ("test_return", "train_steps", "real_steps", "cpu_s")  # of a student
 
 
 def students(
-    ses: Sequence[SE], lessons: Sequence[Lesson], config: LearnConfig, keys: Array, store: Store
+    ses: Sequence[SE], lessons: Sequence[Lesson], config: CommandConfig, keys: Array, store: Store
 ) -> pd.DataFrame:
     """A row for each student on each SE.
 
@@ -59,13 +59,13 @@ def students(
     return pd.concat(tables, ignore_index=True)
 
 
-def teach(ses: Sequence[SE], agent: Agent, config: LearnConfig, keys: Array) -> Arrays:
+def teach(ses: Sequence[SE], agent: Agent, config: CommandConfig, keys: Array) -> Arrays:
     """Trains fresh agents on each SE and tests them on the real task.
 
     Args:
       ses: environment and weights of each SE; all have one configuration.
       agent: the students' agent.
-      config: its `training` is a student's training; students use its `devices`.
+      config: its `training` is a student's training; students use its `devices` and `num_parallel`.
       keys: the students' keys, `[student]`, the same on all SEs.
 
     Returns:
@@ -74,9 +74,9 @@ def teach(ses: Sequence[SE], agent: Agent, config: LearnConfig, keys: Array) -> 
     """
     started, env = time.process_time(), ses[0][0]
     print(f"training {len(ses) * len(keys)} students ...", flush=True)
-    evaluate = functools.partial(evaluate_agents, agent, env, devices=config.devices)
-    params = [env.params(weights) for _, weights in ses]
-    outcomes = [evaluate(x, env.task, config.training, keys) for x in params]
+    how = config.training, keys, config.num_parallel, config.devices
+    evaluate = functools.partial(evaluate_agents, agent, env)
+    outcomes = [evaluate(env.params(weights), env.task, *how) for _, weights in ses]
     outcome = jax.device_get(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outcomes))
     returns = np.asarray(outcome.test_returns, float).mean(axis=-1)
     returns = np.where(outcome.nonfinite, np.nan, returns)

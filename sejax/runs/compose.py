@@ -13,20 +13,17 @@ or objective each. `like` names the section that it builds on, in its file or in
 A user's file holds overrides.
 """
 
-import dataclasses
 import functools
-import hashlib
 import itertools
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
-from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Options, old, registry, require, require_known, shortened
-from sejax.options.plain import defaults_of, expanded, flatten, merge, split, unquoted
+from sejax.options import ConfigError, old, registry, require, require_known, shortened
+from sejax.options.plain import expanded, flatten, merge, split, unquoted
 from sejax.options.registry import key_of
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
@@ -41,7 +38,6 @@ BASES, GENERAL = "bases", "general"  # files of sections to build on, and for ta
 # What reading a file of YAML may raise.
 UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
 Tree = dict[str, Any]  # nested plain values
-Config = TypeVar("Config", bound=Options)
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -75,22 +71,6 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         require(not (others or is_open), name, rule, got=text, use=use)
         texts[CHOICES.get(name, name)] = text
     return texts
-
-
-def partition(overrides: Sequence[str], command: type) -> tuple[Tree, dict[str, str]]:
-    """Splits words into the values of a command's own fields, a tree, and the texts of the others.
-
-    Raises:
-      ConfigError: as `words`.
-    """
-    own, others, known = Tree(), dict[str, str](), defaults_of(command)
-    for name, text in words(overrides).items():
-        group, _, field = name.partition(".")
-        if group in known:
-            own = merge(own, {group: {field: text} if field else text})
-        else:
-            others[name] = text
-    return own, others
 
 
 def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
@@ -194,37 +174,6 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
     pairs = (override.partition("=") for override in overrides)
     values = [[f"{name}{equals}{value}" for value in split(text)] for name, equals, text in pairs]
     return [list(of_run) for of_run in itertools.product(*values)]
-
-
-def swept(
-    overrides: Sequence[str],
-    make: Callable[[list[str]], Config],
-    field: str,
-    folder_of: Callable[[Config, str], str],
-    known: Collection[str] = (),
-) -> list[Config]:
-    """The configuration of each run of a sweep; each run has its own folder.
-
-    Args:
-      overrides: the sweep's words.
-      make: makes a configuration of a run's words.
-      field: the field that names the folder. If it is set, each run has a folder in it.
-      folder_of: else gives the folder, for a configuration and a name made of the swept words.
-      known: fields that default folders are already named by.
-    """
-    configs, by_name = [], {override.partition("=")[0]: override for override in overrides}
-    overrides = [*by_name.values()]  # of words with one name the last counts
-    for of_run in expand(overrides):
-        config = make(of_run)
-        folder = getattr(config, field)
-        named_by = (field,) if folder else known
-        words = [word for word, values in zip(of_run, overrides, strict=True) if word != values]
-        name = as_file_name(",".join(x for x in words if x.partition("=")[0] not in named_by))
-        name = name if len(name) <= 120 else hashlib.sha256(name.encode()).hexdigest()[:16]
-        if name:
-            folder = f"{folder}/{name}" if folder else folder_of(config, name)
-        configs.append(dataclasses.replace(config, **{field: folder}))
-    return configs
 
 
 # --- presets -------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ themselves.
 
 import contextlib
 import dataclasses
+import hashlib
 import itertools
 import textwrap
 from abc import ABC, abstractmethod
@@ -15,7 +16,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 from sejax import agents, envs
 from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
@@ -58,8 +59,6 @@ if TYPE_CHECKING:  # which imports this module
 
 # On the real task.
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
-# Fields that the default run directory is named by.
-IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -67,9 +66,11 @@ IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams",
 
 @dataclass(frozen=True, kw_only=True)
 class CommandConfig(Options, ABC):
-    """What runs and evaluations share.
+    """What all commands share but the search.
 
     Attributes:
+      folder_field: the field that names the folder of the command's files.
+      named_by: fields that the default folder is named by.
       agents: configurations by key, in the keys' order; `agent=ddqn` has the key `ddqn`.
       exploration: intrinsic reward of the agents
       training: training on proxies
@@ -78,12 +79,19 @@ class CommandConfig(Options, ABC):
       devices: null: all
     """
 
+    folder_field: ClassVar[str] = "run_dir"
+    named_by: ClassVar[Collection[str]] = ()
+
     agents: dict[str, AgentConfig] = plugins("agent")
     exploration: ExplorationConfig = plugin("exploration")
     training: TrainingConfig = TrainingConfig()
     seed: WholeNumber = 0
     num_parallel: Count | None = None
     devices: Count | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.agents, "agents", "must have at least one", use="[ddqn]")
 
     @classmethod
     def groups(cls) -> list[str]:
@@ -102,6 +110,40 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: for an unknown choice or preset.
         """
+
+    @property
+    @abstractmethod
+    def default_folder(self) -> str:
+        """The folder, if no field names it."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the command's files."""
+        return Path(getattr(self, self.folder_field) or self.default_folder)
+
+    @classmethod
+    def of_sweep(cls, overrides: Sequence[str]) -> list[Self]:
+        """The configuration of each run of a sweep.
+
+        Each has a folder named by its words: within the folder that the words name, or beside the
+        default one.
+
+        Raises:
+          ConfigError: as `of_words`.
+        """
+        by_name = {override.partition("=")[0]: override for override in overrides}
+        overrides, configs = [*by_name.values()], []  # of words with one name the last counts
+        for of_run in compose.expand(overrides):
+            config = cls.of_words(of_run)
+            folder = getattr(config, cls.folder_field)
+            known = (cls.folder_field,) if folder else cls.named_by
+            words = [word for word, values in zip(of_run, overrides, strict=True) if word != values]
+            name = as_file_name(",".join(x for x in words if x.partition("=")[0] not in known))
+            name = name if len(name) <= 120 else hashlib.sha256(name.encode()).hexdigest()[:16]
+            if name:
+                folder = f"{folder}/{name}" if folder else f"{config.default_folder}_{name}"
+            configs.append(dataclasses.replace(config, **{cls.folder_field: folder}))
+        return configs
 
     @classmethod
     def of_words(cls, overrides: Sequence[str]) -> Self:
@@ -140,8 +182,8 @@ class CommandConfig(Options, ABC):
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
-        for name in [name for name in tree if name not in known]:
-            raise unknown_field(str(name), config.named(config.plain()))
+        for name in flatten({name: tree[name] for name in tree if name not in known}):
+            raise unknown_field(name.removesuffix(".name"), config.named(config.plain()))
         return config
 
     @property
@@ -204,6 +246,9 @@ class CommandConfig(Options, ABC):
             require(limit is None or limit > least, field, must, got=limit, use=4 * least)
 
 
+Config = TypeVar("Config", bound=CommandConfig)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MachinesConfig(Options, ABC):
     """Where agents train.
@@ -249,6 +294,8 @@ class LearnConfig(CommandConfig):
       ConfigError: for parts that cannot work together.
     """
 
+    named_by = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
+
     mixture: MixtureConfig = MixtureConfig()
     preset: str = "best"
     env: registry.Makes[envs.Task] = plugin("env")
@@ -270,7 +317,6 @@ class LearnConfig(CommandConfig):
         require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
-        require(self.agents, "agents", "must have at least one", use="[ddqn]")
         is_alone, given = len(self.agents) == 1, self.mixture.weights
         is_idle = is_alone and self.mixture != MixtureConfig()
         require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
@@ -329,13 +375,13 @@ class LearnConfig(CommandConfig):
         return {"default": of_agents, f"preset={preset['preset']}": preset}
 
     @property
-    def resolved_run_dir(self) -> Path:
-        """The run directory; by default it is named by `IN_RUN_DIR`."""
+    def default_folder(self) -> str:
+        """The run directory, named by the fields of `named_by`."""
         name = "-".join(map(self.name, ("env", "proxy", "agent")))
         explored, varied = self.name("exploration"), self.agent_hparams
         name += f"_{explored}" if explored != "none" else ""
         name += f"_{varied}" if varied != "default" else ""
-        return Path(self.run_dir or Path("runs", as_file_name(f"{name}-s{self.seed}")))
+        return f"runs/{as_file_name(f'{name}-s{self.seed}')}"
 
 
 # --- from words ----------------------------------------------------------------------------------
@@ -352,6 +398,19 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       7
     """
     return LearnConfig.of_words(overrides)
+
+
+def apart(configs: Sequence[Config]) -> list[Config]:
+    """Configurations without repetitions, each with a folder of its own.
+
+    Raises:
+      ConfigError: if two that differ share a folder.
+    """
+    by_folder = {str(config.folder): config for config in configs}
+    must, got = "must differ for each run in letters or digits", next(iter(by_folder), "")
+    are_apart = len(by_folder) == len({str(config) for config in configs})
+    require(are_apart, configs[0].folder_field, must, got=got)
+    return [*by_folder.values()]
 
 
 def default_agent(env: Tree, imports: Collection[str]) -> str:

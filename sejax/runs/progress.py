@@ -1,9 +1,8 @@
 """Lines of progress, and the final message of `sejax.run`."""
 
+import re
 import shlex
 import time
-
-import numpy as np
 
 from sejax.bilevel import Bilevel
 from sejax.ops.scores import reaches
@@ -75,10 +74,8 @@ class RunProgress:
         typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
         typed += ["agent_hparams=as_learned"] * is_own
         words = "".join(f" {shlex.quote(word)}" for word in typed)
-        texts = {name: repr(value) for name, value in env.items()}
-        texts |= {k: f"float('{x}')" for k, x in env.items() if x in (np.inf, -np.inf)}
-        fields = ", ".join(f"{name}={text}" for name, text in texts.items())
-        arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
+        fields = re.sub(r": (-?inf)\b", r": float('\1')", str(env))
+        arguments = f", task=sejax.envs.make(**{fields})" if ":" in env["name"] else ""
         choice = to_plain(self._config.proxy, "proxy")
         arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})" * (":" in proxy)
         self.say(

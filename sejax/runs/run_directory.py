@@ -67,7 +67,7 @@ class RunDirectory(Store):
     """
 
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
-        super().__init__(config.resolved_run_dir, config.plain(), field=field, free=FREE_FIELDS)
+        super().__init__(config.folder, config.plain(), field=field, free=FREE_FIELDS)
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
         self.versions: object = runtime.versions()

@@ -124,12 +124,11 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     Raises:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
-    by_name = {override.partition("=")[0]: override for override in overrides}  # the last counts
-    searched = by_name.keys() - defaults_of(StudyConfig).keys()
-    texts = {name: x.partition("=")[2] for name, x in by_name.items() if name in searched}
+    by_name, known = {x.partition("=")[0]: x for x in overrides}, defaults_of(StudyConfig)
+    texts = {name: x.partition("=")[2] for name, x in by_name.items() if name not in known}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
-    rest = [override for name, override in by_name.items() if name not in ranges]
-    own, others = compose.partition(rest, StudyConfig)
+    others = compose.words([x for name, x in by_name.items() if name not in ranges])
+    own = {name: others.pop(name) for name in known if name in others}
     for name, text in ranges.items():
         require(name not in ONE_VALUE, name, "must be one value in a search", got=text, use="VALUE")
     for name, text in (ranges | others).items():
