@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from optuna import distributions
+from optuna import distributions, trial
 
 from sejax.options import ConfigError, as_text, nearest, require, shortened, told
 from sejax.options.plain import parsed, split
@@ -69,10 +69,11 @@ class Dimension:
                 value = next(x for x in choices if as_text(value) in (x, as_text(parsed(str(x)))))
             elif self.is_inverse and isinstance(value, int | float):
                 value = round(1 - value, 12)
-            is_held = self.distribution._contains(self.distribution.to_internal_repr(value))
+            # It raises for a value outside of the range.
+            trial.create_trial(value=0, params={"x": value}, distributions={"x": self.distribution})
         except (StopIteration, TypeError, ValueError):
             return None
-        return value if is_held else None
+        return value
 
 
 def is_range(text: str) -> bool:
