@@ -81,7 +81,8 @@ def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    return settings.shards.compute(f"seed{seed}", distill.settings_of(config), run)
+    counts = {name: x for name, x in config.plain().items() if name not in config.free}
+    return settings.shards.compute(f"seed{seed}", counts, run)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:

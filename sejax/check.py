@@ -56,7 +56,6 @@ FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, the agent that of
 # Mania et al. (2018) search the hyperparameters for each task; here all tasks share them.
 ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
 ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
-FREE = {"devices", "machines", "out_dir", "num_agents"}  # may change when a command is repeated
 # Rows of the table.
 MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
@@ -76,6 +75,8 @@ class CheckConfig(FreshAgentsConfig):
       null_steps: real steps, at least one generation, of a random search for a policy, and of a PPO
         that follows if the search does not solve the task
     """
+
+    free = ("devices", "machines", "out_dir", "num_agents")
 
     machines: MachinesConfig = plugin("machines")
     algorithms: tuple[str, ...] | None = None
@@ -144,7 +145,7 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     settings["trainings"] = to_plain(on_proxy.trainings)
     rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
     rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
-    store = Store(config.folder, settings, field="out_dir", free=FREE)
+    store = Store(config.folder, settings, field="out_dir", free=config.free)
     with store, config.machines.pool() as pool:
         store.once("check", dict)  # settings are compared, whatever `num_agents` is
         table, null = _trained(config, rows, store, pool), dict[str, Any]()

@@ -49,9 +49,9 @@ class GenerationEvaluator:
 
     Leaves are `[training, ...]`: candidate by candidate, and then the incumbent's trainings.
 
-    One program holds both groups. It spreads each agent's trainings, on candidates and on the
+    One program holds them all. It spreads each agent's trainings, on candidates and on the
     incumbent, over the devices. Each device runs batches of `num_parallel` trainings one after the
-    other. No training executes another agent's branch.
+    other; a batch has trainings of one agent alone.
 
     Args:
       proxy: the proxy; a candidate is a vector of its weights.

@@ -32,7 +32,6 @@ from sejax.options import ConfigError, Count, listed, registry, require_known
 from sejax.options.plain import flatten
 from sejax.proxies import reward
 from sejax.runs import config as configuration
-from sejax.runs import run_directory
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = tuple(x for x, shaping in reward.VARIANTS.items() if not shaping.weighs_info)
@@ -267,7 +266,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     counted = {"generations", "stop_when_solved"}
-    free = run_directory.FREE_FIELDS - counted | {"num_parallel", "num_seeds"}
+    free = {*config.free} - counted | {"num_parallel", "num_seeds"}
     flat = flatten(config.plain())
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 

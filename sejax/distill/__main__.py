@@ -41,7 +41,6 @@ from sejax.runs.store import Store
 STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
 STEPS = {"continuous": 10_000, "discrete": 2000}
 ONE_STEP = SyntheticConfig()  # the form of the SEs
-FREE = ("run_dir", "devices", "num_parallel")  # fields that results do not depend on
 BEGUN = "begun"  # the entry of a search that may be unfinished
 CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
 CHOOSE, TEST = "choose", "test"  # what students are for
@@ -67,6 +66,8 @@ class DistillConfig(CommandConfig):
       num_students: Students of each agent on each SE; their returns choose one of the SEs.
       num_tested: Further students of each agent, on the chosen SE.
     """
+
+    free = ("run_dir", "devices")
 
     env: registry.Makes[envs.Task] = plugin("env")
     preset: str = "distilled"
@@ -154,7 +155,7 @@ def distill(config: DistillConfig, words: str = "") -> Path:
       ConfigError: for a folder of another command, or an invalid policy.
       OSError: if a file cannot be written.
     """
-    with Store(config.folder, settings_of(config)) as store:
+    with Store(config.folder, config.plain(), free=config.free) as store:
         is_new = store.get(CHECKPOINT) is None  # raises for a folder of another command
         store.get(BEGUN)  # raises for other settings
         if is_new and (store.folder / "proxy.safetensors").exists():
@@ -205,11 +206,6 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     write_text(folder / "card.md", zoo.describe(header.read(path), str(folder)).card + "\n")
     print(f"{path} holds the SE of generation {lesson.generation}.")
     return path
-
-
-def settings_of(config: DistillConfig) -> dict[str, Any]:
-    """The settings that the results depend on, as plain values."""
-    return {k: x for k, x in config.plain().items() if k not in FREE}
 
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:

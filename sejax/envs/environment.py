@@ -3,7 +3,7 @@
 Importing anything of gymnax imports all its environments, and with them seaborn and pandas. That
 takes a CPU second. `reset`, `step`, `reset_env`, `step_env`, `is_truncated`, `action_space` and
 `observation_space` are gymnax's, and so are the spaces. So gymnax's wrappers take ours too; only
-`isinstance` tells them apart. gymnax is imported when its spaces are asked for.
+`isinstance` tells them apart. gymnax is imported when `reset`, `step` or a space is asked for.
 """
 
 import dataclasses

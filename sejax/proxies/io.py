@@ -426,8 +426,7 @@ def load_set(
     stored = header.read(source, option, () if kind is None else (kind,), single)
     env = _env_of(stored, task, proxy, option)
     path, tensors, learned = stored
-    if not learned.is_set:
-        tensors = {name: x[None] for name, x in tensors.items()}
+    tensors = tensors if learned.is_set else {name: x[None] for name, x in tensors.items()}
     _require_weights(option, tensors, env, len(learned.proxies), "a file that sejax has written")
     return ProxySet(
         env=env,

@@ -71,6 +71,8 @@ class CommandConfig(Options, ABC):
     Attributes:
       folder_field: the field that names the folder of the command's files.
       named_by: fields that the default folder is named by.
+      free: fields and groups that may change when the command is repeated, which goes on with what
+        the folder holds.
       agents: configurations by key, in the keys' order; `agent=ddqn` has the key `ddqn`.
       exploration: intrinsic reward of the agents
       training: training on proxies
@@ -81,6 +83,7 @@ class CommandConfig(Options, ABC):
 
     folder_field: ClassVar[str] = "run_dir"
     named_by: ClassVar[Collection[str]] = ()
+    free: ClassVar[Collection[str]] = ()
 
     agents: dict[str, AgentConfig] = plugins("agent")
     exploration: ExplorationConfig = plugin("exploration")
@@ -220,8 +223,8 @@ class CommandConfig(Options, ABC):
         """Checks that an agent learns something on a proxy.
 
         Episodes of one-step SEs, and of most SEs with soft ends, last to their limit. On such a
-        proxy a step budget must be long enough for the agent to learn. The stop rule must not read
-        the proxy's returns.
+        proxy a step budget must be long enough for the agent to learn. Training must not stop as
+        solved by the proxy's own returns.
 
         Args:
           key: the agent's key.
@@ -295,6 +298,10 @@ class LearnConfig(CommandConfig):
     """
 
     named_by = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
+    free = (
+        *("generations", "stop_when_solved", "checkpoint_every"),  # how long it runs
+        *("devices", "run_dir", "tracker", "machines"),  # how it is computed
+    )
 
     mixture: MixtureConfig = MixtureConfig()
     preset: str = "best"

@@ -31,9 +31,6 @@ COLUMNS = (
 )
 # Columns that a mixture also has for each agent, with the agent's name at the end.
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
-# Fields and groups that may change between two sessions: a run's length, and how it is computed.
-FREE_FIELDS = {"generations", "stop_when_solved", "checkpoint_every"}
-FREE_FIELDS |= {"devices", "run_dir", "tracker", "machines"}
 
 _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
@@ -67,7 +64,7 @@ class RunDirectory(Store):
     """
 
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
-        super().__init__(config.folder, config.plain(), field=field, free=FREE_FIELDS)
+        super().__init__(config.folder, config.plain(), field=field, free=config.free)
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
         self.versions: object = runtime.versions()

@@ -20,8 +20,6 @@ REDUCTION_FACTOR = 3  # eta of Hyperband
 SET_BY_SEARCH = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
 # Fields that a search cannot vary: scores would not compare, or not depend on them.
 ONE_VALUE = ("env", "proxy", "objective", "seed", "tracker", "devices", "num_parallel")
-# Names, and fields that may differ between the workers of a study and between its sessions.
-FREE = ("trials", "search_dir", "verify", "fresh_seeds", "space", "devices")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +73,10 @@ class StudyPlan:
       config: the search's own fields.
       fixed: overrides of all trials.
       space: dimensions by the field's name.
+      free: settings that may differ between the workers of a study and between its sessions.
     """
+
+    free = ("trials", "search_dir", "verify", "fresh_seeds", "space", "devices")
 
     config: StudyConfig
     fixed: tuple[str, ...]
@@ -109,7 +110,7 @@ class StudyPlan:
         return [f"{name}={x.value(params)}" for name, x in self.space.items()]
 
     def settings(self) -> dict[str, object]:
-        """The settings of a study, plain values; workers may differ in the `FREE` fields."""
+        """The settings of a study, plain values; workers may differ in those that are `free`."""
         ranges = {name: dimension.text for name, dimension in self.space.items()}
         return {**self.default.plain(), **to_plain(self.config), "ranges": ranges}
 

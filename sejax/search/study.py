@@ -31,7 +31,7 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.runtime import platform_error
 from sejax.runs.store import Store
-from sejax.search.config import FREE, REDUCTION_FACTOR, StudyPlan
+from sejax.search.config import REDUCTION_FACTOR, StudyPlan
 
 WAIT = 3600  # s, for another worker's write to the database
 UNUSABLE = (optuna.exceptions.OptunaError, SQLAlchemyError)  # errors of a database
@@ -50,7 +50,7 @@ def open_study(plan: StudyPlan) -> optuna.Study:
     with contextlib.suppress(OSError, ValueError):  # what the next line raises
         (folder / "trials").mkdir(parents=True, exist_ok=True)
     require_writable("search_dir", folder / "trials")
-    store = Store(folder, plan.settings(), field="search_dir", free=FREE)
+    store = Store(folder, plan.settings(), field="search_dir", free=plan.free)
     budgets = plan.config.min_generations, plan.config.max_generations
     # An address would end at a question mark in the folder's name.
     connect = functools.partial(sqlite3.connect, folder / "study.db", WAIT, check_same_thread=False)
