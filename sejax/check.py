@@ -105,9 +105,7 @@ def main(overrides: Sequence[str]) -> None:
     findings(CheckConfig.of_words(overrides))
 
 
-def help_text(overrides: Sequence[str]) -> str:
-    """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(CheckConfig, ['proxy=RUN_DIR', *overrides])}"
+help_text = configuration.help_of(CheckConfig, __doc__)
 
 
 def check(proxy: str | Path, **fields: object) -> dict[str, Any]:

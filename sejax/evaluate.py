@@ -66,9 +66,7 @@ def main(overrides: Sequence[str]) -> None:
         evaluate(config)
 
 
-def help_text(overrides: Sequence[str]) -> str:
-    """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(EvaluateConfig, ['proxy=RUN_DIR', *overrides])}"
+help_text = configuration.help_of(EvaluateConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
@@ -119,4 +117,4 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, configs_of)
+    commands.start(main, help_text, configs_of, resumes=False)

@@ -34,9 +34,7 @@ def main(overrides: Sequence[str]) -> None:
     learn_all(configs_of(overrides))
 
 
-def help_text(overrides: Sequence[str]) -> str:
-    """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(LearnConfig, overrides)}"
+help_text = configuration.help_of(LearnConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
@@ -55,7 +53,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
     A run that differs from the one before only in its seed uses the same executable. After a single
     run it prints where everything is and what to do next; after several runs, a line for each.
-    Ctrl-C and SIGTERM stop at once, with exit codes 130 and 143: finished generations are saved.
+    If it is interrupted, finished generations are saved.
 
     Returns:
       The best score of each run's search mean.
@@ -76,17 +74,12 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
         for config, program in zip(configs, programs, strict=True):
             with RunDirectory(config) as directory:
                 progress = RunProgress(config)
-                try:
-                    if program != compiled:
-                        exit_stack.close()
-                        runtime.configure_jax()
-                        chunks = exit_stack.enter_context(config.machines.make(config))
-                        compiled = program
-                    summary = session.run(config, directory, chunks, progress)
-                except KeyboardInterrupt as stop:
-                    saved = f"{len(directory.rows)} generations are saved"
-                    message = f"Interrupted. {saved} in {directory.folder}; the command resumes"
-                    commands.interrupted(f"{message} from there.", stop)
+                if program != compiled:
+                    exit_stack.close()
+                    runtime.configure_jax()
+                    chunks = exit_stack.enter_context(config.machines.make(config))
+                    compiled = program
+                summary = session.run(config, directory, chunks, progress)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
                 if summary["ended"] == "diverged":
                     diverged.append(directory.folder)

@@ -31,9 +31,9 @@ from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
-from sejax.runs import commands, compose, runtime
+from sejax.runs import agent_words, commands, runtime
 from sejax.runs import config as configuration
-from sejax.runs.compose import Tree
+from sejax.runs.agent_words import Tree
 from sejax.runs.config import CommandConfig, LearnConfig
 from sejax.runs.store import Store
 
@@ -98,7 +98,7 @@ class DistillConfig(CommandConfig):
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
         env = configuration.env_in(typed.get("env", {}), imports)
         actions = envs.spec_of(env).actions
-        if not compose.names_of(typed["agents"]):
+        if not agent_words.names_of(typed["agents"]):
             typed = merge(typed, {"agents": {name: {"name": name} for name in STUDENTS[actions]}})
         # An episode of a one-step SE has one step.
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
@@ -126,16 +126,10 @@ def main(overrides: Sequence[str]) -> None:
     """
     config = DistillConfig.of_words(overrides)
     runtime.configure_jax()
-    try:
-        distill(config, shlex.join(overrides))
-    except KeyboardInterrupt as stop:
-        message = f"Interrupted. The same command resumes from {config.folder}."
-        commands.interrupted(message, stop)
+    distill(config, shlex.join(overrides))
 
 
-def help_text(overrides: Sequence[str]) -> str:
-    """What `--help` prints."""
-    return f"{__doc__}\n{configuration.help_text(DistillConfig, overrides)}"
+help_text = configuration.help_of(DistillConfig, __doc__)
 
 
 # --- what the command does ------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import yaml
 
-from sejax.options import ConfigError, FailedError, place_of, told
+from sejax.options import ConfigError, FailedError, place_of, require, told
 from sejax.options.plain import merge
 from sejax.runs import compose, runtime
 from sejax.runs.config import CommandConfig
@@ -28,6 +28,7 @@ def start(
     main: Callable[[Sequence[str]], object],
     help_text: Callable[[Sequence[str]], str],
     configs_of: Callable[[Sequence[str]], Iterable[CommandConfig]] | None = None,
+    resumes: bool = True,
 ) -> None:
     """Runs a command on the words of the command line; errors become a message and an exit code.
 
@@ -36,13 +37,16 @@ def start(
       help_text: the text of `--help`, a function of the overrides.
       configs_of: the configurations that `--print-config` prints, a function of the overrides; None
         if the command lacks this option.
+      resumes: whether the same command goes on from what is saved.
     """
     words = sys.argv[1:]
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
-    with messages():
-        options = [*HELP, *([PRINT_CONFIG] if configs_of else [])]
-        overrides = [word for word in words if word not in options]
+    with messages(" What has ended is saved; the same command goes on from there." * resumes):
+        can_print = configs_of or PRINT_CONFIG not in words
+        only = "is an option of sejax.run and sejax.evaluate alone. Leave it out."
+        require(can_print, PRINT_CONFIG, only)
+        overrides = [word for word in words if word not in (*HELP, PRINT_CONFIG)]
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
@@ -82,14 +86,19 @@ def _devices(overrides: Sequence[str]) -> int | None:
 
 
 @contextlib.contextmanager
-def messages() -> Iterator[None]:
-    """Ends the process with one message if its block meets bad input or a file that fails."""
+def messages(goes_on: str = "") -> Iterator[None]:
+    """Ends the process with one message if its block meets bad input or a file that fails.
+
+    Args:
+      goes_on: what follows "Interrupted.", after Ctrl-C or SIGTERM.
+    """
     try:
         yield
     except ConfigError as error:
         fail(runtime.platform_error() or str(error), BAD_INPUT)
     except KeyboardInterrupt as stop:
-        interrupted("Interrupted.", stop)
+        print(f"Interrupted.{goes_on}", flush=True)
+        leave(stop.args[0] if stop.args else INTERRUPTED)
     except BrokenPipeError:  # the reader has closed the pipe
         leave(CLOSED)
     except FailedError as error:
@@ -113,12 +122,6 @@ def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(status)
-
-
-def interrupted(message: str, stop: KeyboardInterrupt) -> NoReturn:
-    """Prints the message after Ctrl-C or SIGTERM, and ends the process at once."""
-    print(message, flush=True)
-    leave(stop.args[0] if stop.args else INTERRUPTED)
 
 
 def leave(status: int) -> NoReturn:

@@ -24,11 +24,10 @@ import yaml
 
 from sejax.options import ConfigError, old, registry, require, require_known, shortened
 from sejax.options.plain import expanded, flatten, merge, split, unquoted
-from sejax.options.registry import key_of
+from sejax.runs import agent_words
+from sejax.runs.agent_words import Tree, names_of
 
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
-# `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
-AGENT_BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
 # The text of sejax's own preset files, by their stems.
@@ -37,7 +36,6 @@ PRESETS = {path.stem: path.read_text(encoding="utf-8") for path in FILES}
 BASES, GENERAL = "bases", "general"  # files of sections to build on, and for tasks without a file
 # What reading a file of YAML may raise.
 UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
-Tree = dict[str, Any]  # nested plain values
 
 
 # --- words ---------------------------------------------------------------------------------------
@@ -60,7 +58,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             field = shortened(name.strip("- ") or "NAME")
-            is_field = name.startswith("-") or name in registry.GROUPS
+            is_field = name.startswith("-") or "." in name or name in registry.GROUPS
             value = f"{field}={shortened(text) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
@@ -94,7 +92,12 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
     try:
         values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
-        return [_without_replaced(file, typed, groups, {"agent", "agents"} & texts.keys()), typed]
+        for group in groups:  # fields of a choice that a typed one replaces
+            name = typed.get(group, {}).get("name")
+            if name is not None and file.get(group, {}).get("name", name) != name:
+                del file[group]
+        is_whole = bool(agent_words.WORDS & texts.keys())
+        return [agent_words.without_replaced(file, typed, is_whole), typed]
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -102,66 +105,15 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
         raise ConfigError("preset", must, use="best") from error
 
 
-def _without_replaced(file: Tree, typed: Tree, groups: Collection[str], chosen: set[str]) -> Tree:
-    """The tree of a file without what typed choices replace: other choices' fields, and agents.
-
-    Args:
-      file: the file's tree.
-      typed: the words' tree.
-      groups: see `trees_of`.
-      chosen: names of words that choose all agents; `agents.KEY=ppo` chooses one.
-    """
-    for group in groups:
-        name = typed.get(group, {}).get("name")
-        if name is not None and file.get(group, {}).get("name", name) != name:
-            del file[group]
-    named = file["agents"]
-    if len(named) == 1:
-        file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
-    if names := names_of(typed["agents"]):
-        keys = names.keys() if chosen else named.keys() | names.keys()
-        others = {k for k, x in names_of(named).items() if names.get(k, x) != x}
-        file["agents"] = {key: x for key, x in named.items() if key in keys - others}
-        mixture = dict(file.pop("mixture", {}))
-        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in keys}
-        if len(keys) > 1:
-            file["mixture"] = mixture | {"weights": weights}
-            file.pop("agent", None)
-    return file
-
-
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
-    """Values by their names in words as a tree, in which all agents stand under `agents`.
-
-    `agent=ddqn` and `agents=[ddqn,ppo]` choose agents, and `agents.KEY=ddqn` one by any key.
-    Fields of an only agent, `agent.FIELD`, stay in `agent` until its key is known.
-    """
-    tree: Tree = {"agents": {}}
-    chosen: list[str] = []
-    for name in sorted(values, key=lambda name: name not in ("agent", "agents")):
-        value = values[name]
-        is_choice = name in groups or AGENT_BY_KEY.fullmatch(name)
-        path = [*name.split("."), "name"] if is_choice else name.split(".")
-        if name in ("agent", "agents"):
-            text = str(value)
-            is_list = text.startswith("[") and text.endswith("]")
-            names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
-            several = ",".join(dict.fromkeys(filter(None, [*chosen, *names]))) or "ddqn,ppo"
-            is_clear = all(names) and not chosen and len({*names}) == len(names)
-            fix = f"Set agents=[{shortened(several)}]."
-            require(is_clear, name, "must name each agent once", got=value, fix=fix)
-            chosen, path = names, ["agents"]
-            value = {key_of(x): {"name": x} for x in names}
-        for part in reversed(path):
+    """Values by their names in words as a tree; see `sejax.runs.agent_words` for agents."""
+    tree: Tree = {"agents": agent_words.chosen(values)}
+    for name in [name for name in values if name not in agent_words.WORDS]:
+        value, is_choice = values[name], name in groups or agent_words.BY_KEY.fullmatch(name)
+        for part in reversed([*name.split("."), *(["name"] if is_choice else [])]):
             value = {part: value}
         tree = merge(tree, value)
     return old.of_today(tree)
-
-
-def names_of(agents: Mapping[str, Any]) -> dict[str, str]:
-    """The names of the chosen agents by their keys."""
-    named = {key: x for key, x in agents.items() if isinstance(x, Mapping) and "name" in x}
-    return {key: str(x["name"]) for key, x in named.items()}
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:

@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import textwrap
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +39,6 @@ from sejax.options import (
 )
 from sejax.options.plain import (
     configure,
-    defaults_of,
     flatten,
     from_plain,
     merge,
@@ -49,8 +48,8 @@ from sejax.options.plain import (
     unknown_field,
 )
 from sejax.proxies import ProxyConfig
-from sejax.runs import compose
-from sejax.runs.compose import Tree
+from sejax.runs import agent_words, compose
+from sejax.runs.agent_words import Tree
 from sejax.runs.trackers import Tracker
 from sejax.training import TrainingConfig, require_reachable
 
@@ -71,6 +70,7 @@ class CommandConfig(Options, ABC):
     Attributes:
       folder_field: the field that names the folder of the command's files.
       named_by: fields that the default folder is named by.
+      granted: words that `--help` adds, as the command needs them.
       free: fields and groups that may change when the command is repeated, which goes on with what
         the folder holds.
       agents: configurations by key, in the keys' order; `agent=ddqn` has the key `ddqn`.
@@ -84,6 +84,7 @@ class CommandConfig(Options, ABC):
     folder_field: ClassVar[str] = "run_dir"
     named_by: ClassVar[Collection[str]] = ()
     free: ClassVar[Collection[str]] = ()
+    granted: ClassVar[Sequence[str]] = ()
 
     agents: dict[str, AgentConfig] = plugins("agent")
     exploration: ExplorationConfig = plugin("exploration")
@@ -163,15 +164,9 @@ class CommandConfig(Options, ABC):
         """The layers that words make, by their names; the words themselves are the last one."""
         trees, imports = compose.trees_of(overrides, cls.groups()), compose.plugin_paths(overrides)
         layers = cls.layers_below(merge(*trees), imports)
-        chosen = compose.names_of(merge(*layers.values())["agents"])
-        for name, value in flatten(merge(*(x.get("agent", {}) for x in trees))).items():
-            classes = {key: registry.find("agent", x, imports) for key, x in chosen.items()}
-            known = [key for key, x in classes.items() if name.split(".")[0] in defaults_of(x)]
-            fix = f"Set agents.{(known or [*chosen])[0]}.{name}={shortened(value)}."
-            require(len(chosen) == 1, f"agent.{name}", "must be one agent's", got=value, fix=fix)
-        for tree in trees:
-            tree["agents"] = merge(tree["agents"], {next(iter(chosen)): tree.pop("agent", {})})
-        return layers | {"typed": merge(*trees)}
+        names = agent_words.names_of(merge(*layers.values())["agents"])
+        settled = (agent_words.settled(tree, names, imports) for tree in trees)
+        return layers | {"typed": merge(*settled)}
 
     @classmethod
     def of_tree(cls, tree: Tree, imports: Collection[str] | None) -> Self:
@@ -197,7 +192,7 @@ class CommandConfig(Options, ABC):
 
     def field_of(self, key: str) -> str:
         """The group of an agent's fields in words: `agent`, or `agents.KEY` of several."""
-        return f"agents.{key}" if len(self.agents) > 1 else "agent"
+        return agent_words.as_typed(f"agents.{key}", self.agents)
 
     def agent_for(self, key: str, task: envs.Task, is_varied: bool) -> Agent:
         """The agent of a key, with the exploration, for a task; see `sejax.make_agent`."""
@@ -210,11 +205,7 @@ class CommandConfig(Options, ABC):
 
     def named(self, tree: Tree) -> dict[str, Any]:
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
-        by_key = {f"agents.{key}": self.field_of(key) for key in self.agents}
-        flat = {}
-        for name, value in flatten(tree).items():
-            group = ".".join(name.split(".")[:2])
-            flat[by_key.get(group, group) + name.removeprefix(group)] = value
+        flat = {agent_words.as_typed(name, self.agents): x for name, x in flatten(tree).items()}
         return {name.removesuffix(".name"): x for name, x in flat.items()}
 
     def require_learning(
@@ -373,7 +364,7 @@ class LearnConfig(CommandConfig):
     @classmethod
     def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
-        agent_names = compose.names_of(typed["agents"])
+        agent_names = agent_words.names_of(typed["agents"])
         if not agent_names:
             default = default_agent(typed.get("env", {}), imports)
             agent_names = {default: default}
@@ -436,13 +427,17 @@ def env_in(env: Tree, imports: Collection[str]) -> Any:
     return configure("env", {"name": compose.choice(env, "env")} | env, imports)
 
 
-def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
-    """The text of `--help` for a command and these words.
+def help_of(command: type[CommandConfig], about: str | None) -> Callable[[Sequence[str]], str]:
+    """What `--help` prints: what the command is about, and the `help_text` of its words."""
+    return lambda overrides: f"{about}\n{help_text(command, overrides)}"
 
-    It lists the choices of each group, then the fields of the words' choices. If a value is not the
-    default, the layer that sets it stands beside it.
+
+def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
+    """The choices of each group, then the fields of the words' choices.
+
+    If a value is not the default, the layer that sets it stands beside it.
     """
-    overrides = compose.expand(overrides)[0]  # the first run of a sweep
+    overrides = [*command.granted, *compose.expand(overrides)[0]]  # the first run of a sweep
     layers, choices = command.layers_of(overrides), ("agent", *command.groups())
     config = command.of_tree(merge(*layers.values()), compose.plugin_paths(overrides))
     lines = ["Choices (group=choice):"]

@@ -5,7 +5,7 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import pandas as pd
@@ -17,8 +17,8 @@ from sejax.options import ConfigError, Count, option, registry, require
 from sejax.options.plain import configure, flatten, merge, to_plain
 from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
-from sejax.runs import compose
-from sejax.runs.compose import Tree
+from sejax.runs import agent_words
+from sejax.runs.agent_words import Tree
 from sejax.runs.config import REAL_TRAINING, CommandConfig, default_agent
 from sejax.training import TrainingConfig
 
@@ -56,7 +56,8 @@ class FreshAgentsConfig(CommandConfig):
         training_from=config. Agents as_learned keep the time_limit_is_terminal of the run.
     """
 
-    folder_field: ClassVar[str] = "out_dir"
+    folder_field = "out_dir"
+    granted = ("proxy=RUN_DIR",)
 
     proxy: str
     env: str | None = option(None, names_code=True)
@@ -86,13 +87,13 @@ class FreshAgentsConfig(CommandConfig):
           ConfigError: without a proxy; for agents of the proxy that are neither registered nor
             typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
         """
-        require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE, cartpole, or real")
+        require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE or cartpole")
         # As --print-config has it, whose output may come as preset=FILE.yaml.
         printed = to_plain(TrainingConfig())
         is_default = merge({"training": printed}, typed)["training"] == printed
         is_used = is_default or typed.get("training_from") == "config"
         require(is_used, "training", "must come with training_from=config, or be real_training.*.")
-        names, hparams = compose.names_of(typed["agents"]), typed.get("agent_hparams")
+        names, hparams = agent_words.names_of(typed["agents"]), typed.get("agent_hparams")
         is_learned = hparams == "as_learned" or (not names and hparams is None)
         stored, learned, default = None, Tree(), ""
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
@@ -103,7 +104,7 @@ class FreshAgentsConfig(CommandConfig):
             learned = agents_in(stored.config, imports, is_learned)
             if hparams == "as_learned":
                 require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-                are_same = names in ({}, compose.names_of(stored.config["agents"]))
+                are_same = names in ({}, agent_words.names_of(stored.config["agents"]))
                 fix = "Set agent_hparams=default."
                 require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and is_learned:

@@ -38,9 +38,6 @@ def main(overrides: Sequence[str]) -> None:
         got = f"{plan.folder / 'study.db'} ({told(error.__cause__ or error)})"
         must = f"must hold a database that can be used; got {got}"
         raise ConfigError("search_dir", must, use="FOLDER") from error
-    except KeyboardInterrupt as stop:
-        saved = f"What has ended is saved in {plan.folder}; the same command resumes from there."
-        commands.interrupted(f"Interrupted. {saved}", stop)
 
 
 def help_text(overrides: Sequence[str]) -> str:
