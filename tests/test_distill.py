@@ -103,11 +103,11 @@ def test_damaged_files_and_runs_of_another_command_are_refused(copied):
     words = [*QUICK, f"run_dir={copied}"]
     os.truncate(next(copied.glob("search/*")), 200)
     assert refused(main, words) == "run_dir"
-    (copied / "checkpoint.safetensors").unlink()
+    (copied / "distill.safetensors").unlink()
     assert refused(main, words) == "run_dir"  # it holds an SE
-    (copied / "proxy.safetensors").unlink()
-    assert refused(main, [*words, POLICY]) == "run_dir"  # and a search that may be unfinished
-    (copied / "checkpoint.safetensors").write_bytes(b"")
+    (copied / "proxy.safetensors").rename(copied / "checkpoint.safetensors")
+    assert refused(main, [*words, POLICY]) == "run_dir"  # it holds a run
+    (copied / "distill.safetensors").write_bytes(b"")
     assert refused(main, words) == "run_dir"
 
 

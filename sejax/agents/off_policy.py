@@ -7,7 +7,7 @@ Each agent's own file has its networks, its loss and its targets.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -67,8 +67,6 @@ class ActorCriticOptions(OffPolicyOptions):
       learning_rate: of the actor, the critics and the temperature
       action_repeat: environment steps for each decision
     """
-
-    actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
     learning_rate: Positive = 3e-3  # traced and varied, as in the base class
     action_repeat: Count = 1

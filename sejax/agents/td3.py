@@ -41,6 +41,8 @@ class TD3Config(ActorCriticOptions):
     exploration noise; here tests take the best action.
     """
 
+    actions: ClassVar[tuple[str, ...]] = ("continuous",)
+
     policy_delay: Count = 2
     action_noise_std: NonNegative = option(0.1, traced=True)
     target_noise_std: NonNegative = option(0.2, traced=True)

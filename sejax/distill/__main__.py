@@ -41,8 +41,7 @@ from sejax.runs.store import Store
 STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
 STEPS = {"continuous": 10_000, "discrete": 2000}
 ONE_STEP = SyntheticConfig()  # the form of the SEs
-BEGUN = "begun"  # the entry of a search that may be unfinished
-CHECKPOINT = "checkpoint"  # the folders of sejax.run have an entry of this name too
+BEGUN = "distill"  # the entry that says whose folder it is
 CHOOSE, TEST = "choose", "test"  # what students are for
 
 
@@ -150,10 +149,10 @@ def distill(config: DistillConfig, words: str = "") -> Path:
       OSError: if a file cannot be written.
     """
     with Store(config.folder, config.plain(), free=config.free) as store:
-        is_new = store.get(CHECKPOINT) is None  # raises for a folder of another command
-        store.get(BEGUN)  # raises for other settings
-        if is_new and (store.folder / "proxy.safetensors").exists():
-            raise store.refused(f"must hold no SE of another command; got {store.folder}")
+        if store.get(BEGUN) is None:  # it raises for other settings
+            for name in filter(lambda name: store.file(name).exists(), ("proxy", "checkpoint")):
+                must = f"must hold no {name} of another command; got {store.folder}"
+                raise store.refused(must)
         return _distilled(config, store, words)
 
 
@@ -169,7 +168,7 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
         lessons, costs = copy_policy(config.copy, task, config.policy, keys, store)
-    store.put(CHECKPOINT)
+        store.put(BEGUN)  # now that the policy is known to be one
     ses = [make_exact(task, x.layers, x.states, config.independent_starts) for x in lessons]
     best, rows = 0, pd.DataFrame()
     if len(lessons) > 1:

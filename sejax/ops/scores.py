@@ -1,4 +1,22 @@
-"""Statistics of scores that may not be finite, or equal but for rounding; moments of numbers."""
+"""Statistics of scores that may not be finite, or equal but for rounding; moments of numbers.
+
+What an agent that diverged counts as, step by step:
+
+================================== ================================================================
+step                               its score
+================================== ================================================================
+`Objective.__call__`               nan
+`Scoring.for_strategy`             nan for its candidate
+`scoring.with_diverged_last`       on the incumbent: the lowest one of its algorithm in the
+                                   generation; nan if all trainings with the algorithm diverged
+`Mixture.comparable`               stays nan
+`es.nes`, `es.score_transforms`    the worst: minus infinity where scores are ranked, the lowest
+                                   finite one where they are added
+`Bilevel.tell`                     an incumbent with nan is never the best
+`fresh_agents.summarise`,          in tables: the worst return of all agents
+`distill.teaching.counted`
+================================== ================================================================
+"""
 
 from typing import Any, TypeAlias
 

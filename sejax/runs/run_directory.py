@@ -37,7 +37,7 @@ _STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
 # A killed session may leave temporaries of these files.
 _WRITTEN = ("*.safetensors", _METRICS, _CONFIG, "learning_curve.png", "run.json")
 # Files that a run would replace. Without a checkpoint they are not its own, or it was lost.
-_SIGNS_OF_A_RUN = (_METRICS, _CONFIG, "run.json", "proxy.safetensors", "checkpoint")
+_SIGNS = (_METRICS, _CONFIG, "run.json", "proxy.safetensors", "checkpoint", "distill.safetensors")
 State = TypeVar("State")
 
 
@@ -161,7 +161,7 @@ class RunDirectory(Store):
         """Reads the checkpoint, if there is one."""
         entry = self.get(_CHECKPOINT)
         if entry is None:  # then the folder must hold no run, also none of an older sejax
-            for name in filter(lambda name: (self.folder / name).exists(), _SIGNS_OF_A_RUN):
+            for name in filter(lambda name: (self.folder / name).exists(), _SIGNS):
                 must = "must be new or hold the checkpoint of its run"
                 raise self.refused(f"{must}; got {self.folder}, whose {name} would be replaced")
             return
