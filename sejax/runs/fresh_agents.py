@@ -94,41 +94,38 @@ class FreshAgentsConfig(CommandConfig):
         is_used = is_default or typed.get("training_from") == "config"
         require(is_used, "training", "must come with training_from=config, or be real_training.*.")
         names, hparams = agent_words.names_of(typed["agents"]), typed.get("agent_hparams")
-        is_learned = hparams == "as_learned" or (not names and hparams is None)
-        stored, learned, default = None, Tree(), ""
+        is_as_learned = hparams == "as_learned" or (not names and hparams is None)
+        stored, learned = None, Tree()
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
-                default = agents.default_for(stored.spec)
         if stored:
-            learned = agents_in(stored.config, imports, is_learned)
-            if hparams == "as_learned":
-                require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-                are_same = names in ({}, agent_words.names_of(stored.config["agents"]))
-                fix = "Set agent_hparams=default."
-                require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
-        if learned and is_learned:
+            learned = learned_agents(stored.config, imports, is_as_learned)
+        if stored and hparams == "as_learned":
+            require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
+            are_same = names in ({}, agent_words.names_of(learned["agents"]))
+            fix = "Set agent_hparams=default."
+            require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
+        if learned and is_as_learned:
             stored_name = learned["exploration"]["name"]
             if typed.get("exploration", {}).get("name", stored_name) != stored_name:
                 del learned["exploration"]
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
-        default = default or default_agent({"name": typed.get("env", "cartpole")}, imports)
-        names = names or {default: default}
+        if not names:
+            env = {"name": typed.get("env", "cartpole")}
+            name = agents.default_for(stored.spec) if stored else default_agent(env, imports)
+            names = {name: name}
         known = learned.get("agents", {}) if hparams is None else {}
-        chosen = Tree()
-        for key, name in names.items():
-            same = {k: agent for k, agent in known.items() if agent["name"] == name}
-            chosen[key] = same.get(key) or next(iter(same.values()), {"name": name})
-        return {"proxy": {"agents": chosen}}
+        return {"proxy": {"agents": {key: like(known, key, name) for key, name in names.items()}}}
 
 
-def agents_in(config: Mapping[str, Any], imports: Collection[str], is_learned: bool) -> Tree:
-    """What a stored configuration says of its agents; empty if one is not known.
+def learned_agents(config: Mapping[str, Any], imports: Collection[str], is_to_train: bool) -> Tree:
+    """The agents that a proxy was learned with, and what they need; empty if one is not known.
 
     Args:
-      config: of a proxy's file.
+      config: of the proxy's file.
       imports: each `module:attribute` that the user has typed.
-      is_learned: whether these agents are to train.
+      is_to_train: whether these agents are to train.
 
     Raises:
       ConfigError: if one that is to train is neither registered nor typed.
@@ -137,12 +134,18 @@ def agents_in(config: Mapping[str, Any], imports: Collection[str], is_learned: b
     named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
     unknown = [(group, x) for group, x in named if not header.is_registered(group, x)]
     for group, x in unknown:
-        registry.require_typed(group, str(x.get("name")), imports if is_learned else None)
+        registry.require_typed(group, str(x.get("name")), imports if is_to_train else None)
     if not config["agents"] or any(x.get("name") not in imports for _, x in unknown):
         return {}
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}
     return {"agents": config["agents"], "exploration": explored, "real_training": real_training}
+
+
+def like(known: Mapping[str, Tree], key: str, name: str) -> Tree:
+    """An agent with the hyperparameters of a known one of its name, best of its key."""
+    same = {k: agent for k, agent in known.items() if agent["name"] == name}
+    return same.get(key) or next(iter(same.values()), {"name": name})
 
 
 def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
