@@ -46,7 +46,7 @@ from sejax.proxies.io import Proxy
 from sejax.runs import commands, compose, fresh_agents, plots, runtime
 from sejax.runs import config as configuration
 from sejax.runs.chunks import Pool
-from sejax.runs.config import REAL_TRAINING, MachinesConfig
+from sejax.runs.config import PLACES, REAL_TRAINING, MachinesConfig
 from sejax.runs.fresh_agents import FreshAgentsConfig, World
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
@@ -69,6 +69,8 @@ class CheckConfig(FreshAgentsConfig):
 
     Attributes:
       machines: where agents train
+      agent_hparams: as_learned: agents and exploration that the proxy was learned with, if no
+        agent is named; default: the agent's.
       algorithms: Other agents than those it was learned with, with default hyperparameters; null:
         all that fit the task.
       out_dir: null: runs/check-<proxy>
@@ -76,7 +78,7 @@ class CheckConfig(FreshAgentsConfig):
         that follows if the search does not solve the task
     """
 
-    free = ("devices", "machines", "out_dir", "num_agents")
+    free = (*PLACES, "num_agents")
 
     machines: MachinesConfig = plugin("machines")
     algorithms: tuple[str, ...] | None = None

@@ -29,6 +29,7 @@ class EvaluateConfig(FreshAgentsConfig):
     """What `sejax.evaluate` takes.
 
     Attributes:
+      proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
       baseline: whether as many agents train on the real task, for comparison
       out_dir: null: beside the proxy; of a sweep, and if the proxy has no folder,
         runs/evaluate-<proxy>
@@ -72,8 +73,9 @@ help_text = configuration.help_of(EvaluateConfig, __doc__)
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     configs = EvaluateConfig.of_sweep(overrides)
-    if len(configs) > 1:
-        configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
+    if len(configs) == 1:
+        return configs
+    configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
     return configuration.apart(configs)
 
 
@@ -111,9 +113,8 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
     """A row for each agent of an algorithm, whose key is `agent`."""
     who = f"{key} agents" if len(config.agents) > 1 else "agents"
     print(f"training {config.num_agents:,} {who} on {name} ...", flush=True)
-    columns = fresh_agents.train(config, world, key)
-    numbers = range(config.num_agents)
-    return pd.DataFrame({"agent": key, "number": numbers, **columns, "world": name})
+    columns = fresh_agents.train(config, world, key) | {"world": name}
+    return pd.DataFrame({"agent": key, "number": range(config.num_agents), **columns})
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, option, registry
+from sejax.options import Count, option, registry, require
 from sejax.options.plain import defaults_of, flatten, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -34,7 +34,7 @@ from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import agent_words, commands, runtime
 from sejax.runs import config as configuration
 from sejax.runs.agent_words import Tree
-from sejax.runs.config import CommandConfig, LearnConfig
+from sejax.runs.config import PLACES, CommandConfig, LearnConfig
 from sejax.runs.store import Store
 
 # The default students and how many steps they train, by kind of actions.
@@ -66,7 +66,7 @@ class DistillConfig(CommandConfig):
       num_tested: Further students of each agent, on the chosen SE.
     """
 
-    free = ("run_dir", "devices")
+    free = PLACES
 
     env: registry.Makes[envs.Task] = plugin("env")
     preset: str = "distilled"
@@ -82,6 +82,8 @@ class DistillConfig(CommandConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
+        is_fit = spec.states == "vector"
+        require(is_fit, "env", "must observe vectors", got=task_name, use="cartpole")
         for key, agent in self.agents.items():
             agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
             self.require_learning(key, "training", self.training, ONE_STEP, spec)

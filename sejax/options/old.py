@@ -8,7 +8,7 @@ from sejax.options import registry
 # Fields of earlier versions. A file may still set a field to its value here: it changes nothing.
 GONE: dict[str, object] = {"agent.torso": None, "agent.num_filters": 16, "agent.loss": "squared"}
 GONE |= {f"agent.{x}": 1 for x in ("train_every", "gradient_steps", "target_update_every")}
-GONE |= {"agent.noisy_tests": False, "mixture.compared_by": "advantage"}
+GONE |= {"baseline": True, "agent.noisy_tests": False, "mixture.compared_by": "advantage"}
 GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True}
 
 

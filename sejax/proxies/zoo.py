@@ -6,7 +6,7 @@ This module reads the headers of files. `tools/ship_proxy.py` writes the shipped
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -82,6 +82,8 @@ class PretrainedProxy:
       evaluations: results of fresh agents.
       learning: its run; None if not recorded.
       policy_return: return of the policy that it was made of; None if it was learned with agents.
+      needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
+        file's names are never imported.
     """
 
     name: str
@@ -95,6 +97,7 @@ class PretrainedProxy:
     evaluations: tuple[Evaluation, ...] = field(default=(), repr=False)
     learning: Learning | None = field(default=None, repr=False)
     policy_return: float | None = None
+    needs: tuple[str, ...] = ()
 
     @property
     def on_proxy(self) -> tuple[Evaluation, ...]:
@@ -140,6 +143,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
         "task": learned.task,
         "settings": config["proxy"],
         "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
+        "needs": [x for x in ("env", "proxy") if not header.is_registered(x, config[x])],
     }
     return from_plain(PretrainedProxy, values, "record")
 
@@ -155,21 +159,17 @@ _ROW = (  # of an evaluation
 )
 
 
-def card_of(
-    proxy: PretrainedProxy, source: str, needs: Sequence[str] = (), license: str = ""
-) -> str:
+def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
     """A proxy's model card: `card.md` filled with its values. Parts without values are left out.
 
     Args:
       proxy: what its file tells.
       source: what `sejax.load` takes. For an address on the Hub the card gets front matter.
-      needs: groups (`env`, `proxy`) whose configuration must be given to `sejax.load`, because a
-        file's names are never imported.
       license: name of the license; by default that of the shipped proxies.
     """
     kind = proxy.kind if proxy.kind in _KINDS else "other"
-    call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in needs)])
-    words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in needs)
+    call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[x]}=..." for x in proxy.needs)])
+    words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in proxy.needs)
     gym = f"env = sejax.gym.make({call})  # a gymnasium.Env, in NumPy: any agent\n"
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     if best and best.hparams != "as_learned":
@@ -225,10 +225,9 @@ def push(
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
     stored, address = header.read(source, single=True), f"{hub.SCHEME}{repo}"
-    is_repo, config = hub.parse(address, "repo")[0] == repo, stored.header.config
+    is_repo = hub.parse(address, "repo")[0] == repo
     require(is_repo, "repo", "must be USER/REPO on the Hub", got=repo)
-    needs = [group for group in ("env", "proxy") if not header.is_registered(group, config[group])]
-    card = card_of(describe(stored, repo.rpartition("/")[2]), address, needs, license)
+    card = card_of(describe(stored, repo.rpartition("/")[2]), address, license)
     with hub.explained("repo", repo):
         from huggingface_hub import CommitOperationAdd, HfApi
 

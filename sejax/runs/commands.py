@@ -43,9 +43,8 @@ def start(
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
     with messages(" What has ended is saved; the same command goes on from there." * resumes):
-        can_print = configs_of or PRINT_CONFIG not in words
-        only = "is an option of sejax.run and sejax.evaluate alone. Leave it out."
-        require(can_print, PRINT_CONFIG, only)
+        is_known = configs_of or PRINT_CONFIG not in words
+        require(is_known, PRINT_CONFIG, "is of sejax.run and sejax.evaluate alone. Leave it out.")
         overrides = [word for word in words if word not in (*HELP, PRINT_CONFIG)]
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):

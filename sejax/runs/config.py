@@ -56,6 +56,7 @@ from sejax.training import TrainingConfig, require_reachable
 if TYPE_CHECKING:  # which imports this module
     from sejax.runs.chunks import Chunks, Pool
 
+PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
 # On the real task.
 REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 
@@ -180,8 +181,11 @@ class CommandConfig(Options, ABC):
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
-        for name in flatten({name: tree[name] for name in tree if name not in known}):
-            raise unknown_field(name.removesuffix(".name"), config.named(config.plain()))
+        unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
+        for name in flatten(unknown) or unknown:
+            is_of_run = name.partition(".")[0] in LearnConfig.__dataclass_fields__
+            require(not is_of_run, name, "has no effect in this command. Leave it out.")
+            raise unknown_field(name, config.named(config.plain()))
         return config
 
     @property
@@ -289,10 +293,8 @@ class LearnConfig(CommandConfig):
     """
 
     named_by = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
-    free = (
-        *("generations", "stop_when_solved", "checkpoint_every"),  # how long it runs
-        *("devices", "run_dir", "tracker", "machines"),  # how it is computed
-    )
+    # How long it runs, and how it is computed.
+    free = ("generations", "stop_when_solved", "checkpoint_every", *PLACES, "tracker")
 
     mixture: MixtureConfig = MixtureConfig()
     preset: str = "best"
@@ -439,16 +441,17 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     """
     overrides = [*command.granted, *compose.expand(overrides)[0]]  # the first run of a sweep
     layers, choices = command.layers_of(overrides), ("agent", *command.groups())
-    config = command.of_tree(merge(*layers.values()), compose.plugin_paths(overrides))
+    tree = merge(*layers.values())
+    config = command.of_tree(tree, compose.plugin_paths(overrides))
     lines = ["Choices (group=choice):"]
     for group in choices:
         prefixes = ["gymnax/ID"] if group == "env" else []
-        known = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
-        lines += [textwrap.fill(f"  {group}: {known}", 98, subsequent_indent=" " * 6)]
+        names = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
+        lines += [textwrap.fill(f"  {group}: {names}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
-    if isinstance(config, LearnConfig):
-        presets = compose.sections_of(config.name("env"), config.name("proxy"))
-        lines += [f"  preset: {', '.join([*presets, 'FILE.yaml'])}"]
+    if "preset" in vars(config):
+        known = compose.sections_of(*(compose.choice(tree.get(x, {}), x) for x in ("env", "proxy")))
+        lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
     classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]

@@ -45,7 +45,7 @@ class FreshAgentsConfig(CommandConfig):
     """Which agents train on which proxy, and for how long.
 
     Attributes:
-      proxy: a run directory, a safetensors file, a shipped name (cartpole), or real
+      proxy: a run directory, a safetensors file, or a shipped name (cartpole)
       env: the task, if proxy=real or if the proxy's task is your own
       proxy_kind: my_module:MyProxy, if the proxy's class is your own
       agent_hparams: as_learned: agents and exploration that the proxy was learned with, if no
@@ -173,12 +173,11 @@ def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
     is_varied = config.agent_hparams == "varied"
     if proxy is not None and config.agent_hparams == "as_learned":
         is_varied = proxy.config.get("agent_hparams") == "varied"
-    worlds = {}
-    if proxy is not None:
-        worlds["the proxy"] = World(proxy.env, proxy.params, task, trainings, is_varied)
-    trainings = dict.fromkeys(trainings, real_training)
-    worlds["the real task"] = World(task.env, task.params, task, trainings, is_varied)
-    return worlds
+    on_task = World(task.env, task.params, task, dict.fromkeys(trainings, real_training), is_varied)
+    if proxy is None:
+        return {"the real task": on_task}
+    on_proxy = World(proxy.env, proxy.params, task, trainings, is_varied)
+    return {"the proxy": on_proxy, "the real task": on_task}
 
 
 def loaded(config: FreshAgentsConfig) -> Proxy:

@@ -74,8 +74,9 @@ class RunProgress:
         typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
         typed += ["agent_hparams=as_learned"] * is_own
         words = "".join(f" {shlex.quote(word)}" for word in typed)
-        fields = re.sub(r": (-?inf)\b", r": float('\1')", str(env))
-        arguments = f", task=sejax.envs.make(**{fields})" if ":" in env["name"] else ""
+        texts = {k: re.sub(r"^-?inf$", r"float('\g<0>')", repr(x)) for k, x in env.items()}
+        fields = ", ".join(f"{name}={text}" for name, text in texts.items())
+        arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
         choice = to_plain(self._config.proxy, "proxy")
         arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})" * (":" in proxy)
         self.say(
