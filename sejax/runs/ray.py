@@ -15,7 +15,7 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
@@ -70,9 +70,7 @@ class RayConfig(MachinesConfig):
         parts = config.plain().items()
         setup = json.dumps({name: x for name, x in parts if name not in ("tracker", "machines")})
         with self.pool() as pool:
-            yield RemoteChunks(
-                config, lambda shares: pool(outcomes_of, [(setup, x) for x in shares])
-            )
+            yield RemoteChunks(config, lambda sent: pool(outcomes_of, [(setup, x) for x in sent]))
 
     @contextlib.contextmanager
     def pool(self) -> Iterator[Pool]:
@@ -128,7 +126,7 @@ class RemoteChunks(Chunks):
     def __init__(
         self,
         config: LearnConfig,
-        compute: Callable[[Sequence[WorkShare]], Sequence[tuple[Outcome, float]]],
+        compute: Callable[[Sequence[WorkShare]], Iterable[tuple[Outcome, float]]],
     ):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._compute = compute
@@ -210,8 +208,10 @@ def num_workers(machines: RayConfig) -> int:
 
 def _on_cluster(
     machines: RayConfig, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]
-) -> list[Any]:
-    """A function's results for tuples of arguments; as many calls at a time as there are workers.
+) -> Iterator[Any]:
+    """A function's results for tuples of arguments, in their order, each as soon as it is there.
+
+    As many calls run at a time as there are workers.
 
     Raises:
       FailedError: if a worker raises an error or dies again and again, or the cluster is lost.
@@ -219,22 +219,23 @@ def _on_cluster(
     import ray  # it comes with an extra
 
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
-    most, versions, tasks, running = num_workers(machines), runtime.versions(), [], []
-    for i, item in enumerate(items, 1):
-        tasks.append(task.remote(versions, function, item))
-        running.append(tasks[-1])
-        while len(running) >= (most if i < len(items) else 1):
-            done, running = ray.wait(running, timeout=LOOK_S)
-            if not done:
-                num_workers(machines)  # raises if the cluster is gone
+    most, versions = num_workers(machines), runtime.versions()
+    tasks, running = list[Any](), list[Any]()
     try:
-        results: list[Any] = ray.get(tasks)
+        for i in range(len(items)):
+            while i >= len(tasks) or tasks[i] in running:
+                for item in items[len(tasks) :][: most - len(running)]:
+                    tasks.append(task.remote(versions, function, item))
+                    running.append(tasks[-1])
+                done, running = ray.wait(running, timeout=LOOK_S)
+                if not done:
+                    num_workers(machines)  # raises if the cluster is gone
+            yield ray.get(tasks[i])
     except ray.exceptions.RayError as error:  # its last line is the worker's error
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)
         fix = "the same command with machines=local resumes here."
         message = f"A worker has failed: {reason}. What was finished before is saved; {fix}"
         raise FailedError(message) from error
-    return results
 
 
 # --- a worker -------------------------------------------------------------------------------------
