@@ -57,7 +57,7 @@ FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, the agent that of
 ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
 ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
 # Rows of the table.
-MYOPIC, OWN, OTHERS = "the proxy, discount 0", "the proxy", "the proxy, other algorithms"
+MYOPIC, OWN, OTHERS = "the proxy, discount {:g}", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
 SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
 Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
@@ -138,7 +138,7 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     worlds = fresh_agents.worlds_of(dataclasses.replace(config, agents=students)).values()
     on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
-    on_task.trainings[tuned] = config.real_training
+    on_task = on_task._replace(trainings=on_task.trainings | {tuned: config.real_training})
     config = dataclasses.replace(config, agents=students | {tuned: _tuned(task)})
     settings = config.plain() | {"task": task.origin, "discount": proxy.discount}
     settings["proxy"] = {"weights": proxy.fingerprint} | to_plain(proxy.env.config, "proxy")
@@ -201,7 +201,7 @@ def _myopic(learned: dict[str, AgentConfig]) -> dict[str, dict[str, Any]]:
     rows = dict[str, dict[str, Any]]()
     for x in DISCOUNTS:
         with_it = ((key, dataclasses.replace(a, **{"discount": x})) for key, a in learned.items())
-        rows[f"the proxy, discount {x:g}"] = {f"{key}-{x:g}": agent for key, agent in with_it}
+        rows[MYOPIC.format(x)] = {f"{key}-{x:g}": agent for key, agent in with_it}
     return rows
 
 
@@ -317,7 +317,7 @@ def _judgements(
     judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
     for key in learned:
         floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
-        myopic = scores.get((MYOPIC, f"{key}-0"), scores[OWN, key])
+        myopic = scores.get((MYOPIC.format(0), f"{key}-0"), scores[OWN, key])
         judgements[key] = judge(myopic, scores[OWN, key], floor, top)
     return judgements
 

@@ -96,7 +96,7 @@ class GenerationEvaluator:
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.num_trainings = [scoring.trainings_of(i).size for i in range(len(agents))]
+        self.num_trainings = [scoring.training_numbers(i).size for i in range(len(agents))]
         self._scoring = scoring
         self._spread = spread_groups_over_devices(
             self.evaluators, devices, num_parallel, self.widths
@@ -111,7 +111,7 @@ class GenerationEvaluator:
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
         num_evals = self._scoring.strategy.num_evals
         for agent_index, size in enumerate(self.num_trainings):
-            numbers = self._scoring.trainings_of(agent_index)
+            numbers = self._scoring.training_numbers(agent_index)
             rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
@@ -132,6 +132,6 @@ class GenerationEvaluator:
         """
         if len(by_agent) == 1:
             return by_agent[0]
-        numbers = [self._scoring.trainings_of(i) for i in range(len(by_agent))]
+        numbers = [self._scoring.training_numbers(i) for i in range(len(by_agent))]
         order = np.argsort(np.concatenate(numbers))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

@@ -111,7 +111,7 @@ class Scoring:
         return self.mixture.deal(self.strategy.population_size, self.strategy.antithetic)
 
     @property
-    def agent_of(self) -> np.ndarray:
+    def agent_numbers(self) -> np.ndarray:
         """The number of each training's agent, `[training]`: the last row of the table above."""
         of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
         for agent_index, numbers in enumerate(self.candidates_of):
@@ -120,9 +120,9 @@ class Scoring:
         of_incumbent = np.arange(self.num_incumbent_evals) % self.mixture.size
         return np.concatenate([of_population, of_incumbent])
 
-    def trainings_of(self, agent_index: int) -> np.ndarray:
+    def training_numbers(self, agent_index: int) -> np.ndarray:
         """The numbers of an agent's trainings among all trainings of a generation."""
-        return np.flatnonzero(self.agent_of == agent_index)
+        return np.flatnonzero(self.agent_numbers == agent_index)
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""
@@ -183,7 +183,7 @@ class Scoring:
         means, num_in_population = [], scores.size - self.num_incumbent_evals
         population, incumbent = jnp.split(scores, [num_in_population])
         for agent_index in range(self.mixture.size):
-            numbers = self.trainings_of(agent_index)
+            numbers = self.training_numbers(agent_index)
             on_incumbent = numbers[numbers >= num_in_population] - num_in_population
             of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
             repaired, mean = with_diverged_last(*of_agent)
@@ -203,7 +203,7 @@ class Scoring:
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
         """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
-        by_agent = map(self.trainings_of, range(self.mixture.size))
+        by_agent = map(self.training_numbers, range(self.mixture.size))
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
 
 

@@ -342,7 +342,7 @@ class LearnConfig(CommandConfig):
         return envs.make_from(self.env)
 
     def parts(self) -> dict[str, Any]:
-        """The objects that the configuration describes: the arguments of `sejax.make_learner`."""
+        """The arguments of `sejax.make_learner`: objects, or configurations that make them."""
         task, is_varied = self.task(), self.agent_hparams == "varied"
         learners = tuple(self.agent_for(key, task, is_varied) for key in self.agents)
         mixture = Mixture(

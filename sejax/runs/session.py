@@ -54,8 +54,8 @@ def run(
     state = _begin(config.seed, directory, chunks, report)
     drawn, num_trainings = time.monotonic(), sum(bilevel.evaluate.num_trainings)
     folder, first = directory.folder.resolve(), len(directory.rows)
-    run = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
-    with contextlib.closing(GuardedTracker(config.tracker, run, report.say)) as tracker:
+    about = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
+    with contextlib.closing(GuardedTracker(config.tracker, about, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
             if first and all(float(x["num_nonfinite"]) == num_trainings for x in directory.rows):
                 break  # every agent of every generation has diverged
