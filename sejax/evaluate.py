@@ -18,6 +18,7 @@ from pathlib import Path
 import pandas as pd
 
 from sejax.ops.files import as_file_name, require_writable, write_text
+from sejax.options import require
 from sejax.proxies import header, hub
 from sejax.runs import commands, fresh_agents, runtime
 from sejax.runs import config as configuration
@@ -38,6 +39,12 @@ class EvaluateConfig(FreshAgentsConfig):
     named_by = ("proxy",)
 
     baseline: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
+            is_idle = self.proxy == "real" and getattr(self, name) == idle
+            require(not is_idle, name, "must be left out with proxy=real", got=idle)
 
     @property
     def default_folder(self) -> str:

@@ -4,6 +4,16 @@ A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.comp
 the words. `CommandConfig.layers_of` puts choices and presets below it. `sejax.options.plain` makes
 dataclasses of the merged layers, and reads each value by its field's type. The dataclasses check
 themselves.
+
+Example:
+  >>> words = ["agent.learning_rate=1e-3"]
+  >>> compose.trees_of(words, LearnConfig.groups())
+  [{'agents': {}, 'agent': {'learning_rate': '1e-3'}}]
+  >>> layers = LearnConfig.layers_of(words)  # each lies over those before it
+  >>> list(layers), layers["typed"]
+  (['default', 'preset=best', 'typed'], {'agents': {'ddqn': {'learning_rate': '1e-3'}}})
+  >>> LearnConfig.of_tree(merge(*layers.values()), imports=()).agents["ddqn"].learning_rate
+  0.001
 """
 
 import contextlib

@@ -68,12 +68,6 @@ class FreshAgentsConfig(CommandConfig):
     out_dir: str | None = None
     real_training: TrainingConfig = REAL_TRAINING
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, idle in (("agent_hparams", "as_learned"), ("training_from", "config")):
-            is_idle = self.proxy == "real" and getattr(self, name) == idle
-            require(not is_idle, name, "must be left out with proxy=real", got=idle)
-
     @classmethod
     def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
         """What agents take from the run that learned the proxy.
