@@ -186,15 +186,15 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
         """
-        known = {field.name for field in dataclasses.fields(cls)}
+        known, of_run = ({x.name for x in dataclasses.fields(c)} for c in (cls, LearnConfig))
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
         unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
         for name in flatten(unknown) or unknown:
-            is_of_run = name.partition(".")[0] in LearnConfig.__dataclass_fields__
-            require(not is_of_run, name, "has no effect in this command. Leave it out.")
+            is_idle = name.partition(".")[0] in of_run
+            require(not is_idle, name, "has no effect in this command. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 
