@@ -188,8 +188,9 @@ def make_trainer(
         proxy's params allow longer episodes than its task, the buffer may hold fewer steps than the
         agent asks for.
       training: stopping rule and limits. `time_limit_is_terminal` concerns real time limits and is
-        ignored in an SE. There the last step of an episode bootstraps with the done network's
-        output, as in the authors' code.
+        ignored in an SE. There the last step of an episode bootstraps as the SE's
+        `info["discount"]` says: with 1 minus the done network's output if `proxy.done=soft`, as in
+        the authors' code.
       solved_reward: for `stop_rule="solved"`.
       test_fn: plays tests on the real task; called after each training episode if
         `training.tests_after_each` is not 0.

@@ -28,7 +28,8 @@ class MixtureConfig(Options):
     """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line.
 
     Attributes:
-      aggregate: Each agent scores the search mean; the mean of these scores counts, or the worst.
+      aggregate: Each agent scores the search mean. The mean of these scores, or the worst, is
+        shown, keeps the best proxy and ends a run. The search compares advantages either way.
       weights: share of the candidates that train each agent, 1 if left out; with 0 an agent only
         judges the search mean
     """
@@ -48,7 +49,8 @@ class Mixture:
       names: of the agents, for tables; their numbers if not given.
       weights: shares of the candidates that each agent trains on; equal if not given. An agent of
         weight 0 trains on the incumbent alone.
-      aggregate: whether the mean of the agents' scores counts, or the worst.
+      aggregate: whether the mean of the agents' scores of the incumbent is shown and keeps the best
+        proxy, or the worst. The strategy compares advantages either way.
 
     Raises:
       ConfigError: without agents, unless each has a name and a weight, for a weight below 0, if

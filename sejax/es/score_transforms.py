@@ -27,7 +27,7 @@ def linear(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
     r"""Maps scores linearly to [0, 1]: :math:`F_i = (K_i - \min K) / (\max K - \min K)`.
 
     Args:
-      scores: `[pop]` test return of each candidate, in reward units.
+      scores: `[pop]`, of each candidate, in the objective's unit.
       incumbent: not used.
 
     Returns:

@@ -1,7 +1,8 @@
 """Spreading independent elements of work over devices, and over vmapped batches on each.
 
-Plain form: `jax.lax.map(fn, args)`, one element after the other on one device; equal to the bit for
-any number of devices (`tests/test_parallel.py`).
+Plain form: `jax.lax.map(fn, args)`, one element after the other on one device. Results are equal to
+the bit for any number of devices, and up to rounding for any width of a batch
+(`tests/test_parallel.py`).
 """
 
 import functools

@@ -287,7 +287,7 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     use = "VALUE" if is_open else as_text(default)
     if isinstance(got, Mapping):
-        must = "have no fields"
+        raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.")
     if must == "be a valid tuple":
         must, use = "be a list in brackets", f"[{shortened(got, 20)}]"
     raise ConfigError(name, f"must {must}", got=repr(got), use=use)

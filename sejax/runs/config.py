@@ -273,7 +273,7 @@ class MachinesConfig(Options, ABC):
         """The compiled generations of a run."""
 
     def pool(self) -> AbstractContextManager["Pool"]:
-        """Calls a function with each of several tuples of arguments, one after the other."""
+        """A context that gives a `Pool`; by default one that calls here, one after the other."""
         return contextlib.nullcontext(itertools.starmap)
 
 

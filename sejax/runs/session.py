@@ -49,8 +49,9 @@ def run(
       OSError: if a file cannot be written; everything saved before is whole.
     """
     report, bilevel = report or RunProgress(config, is_quiet=True), chunks.bilevel
-    start_wall_s = float(directory.last("wall_s")) - time.monotonic()
-    start_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
+    # What the clocks lack of the seconds of all sessions.
+    earlier_wall_s = float(directory.last("wall_s")) - time.monotonic()
+    earlier_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn, num_trainings = time.monotonic(), sum(bilevel.evaluate.num_trainings)
     folder, first = directory.folder.resolve(), len(directory.rows)
@@ -64,8 +65,8 @@ def run(
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
-                wall_s = start_wall_s + time.monotonic()
-                cpu_s = start_cpu_s + time.process_time() + chunks.cpu_s
+                wall_s = earlier_wall_s + time.monotonic()
+                cpu_s = earlier_cpu_s + time.process_time() + chunks.cpu_s
                 rows = directory.save(saved, info, wall_s, cpu_s)
                 save_proxies(directory, bilevel, saved, first)
             for generation in _finished(rows, info):
@@ -75,7 +76,7 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    wall_s, cpu_s = start_wall_s + time.monotonic(), start_cpu_s + time.process_time()
+    wall_s, cpu_s = earlier_wall_s + time.monotonic(), earlier_cpu_s + time.process_time()
     return _summary(directory, bilevel, state, wall_s, cpu_s + chunks.cpu_s)
 
 
