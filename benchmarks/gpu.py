@@ -281,7 +281,7 @@ def generation(size: int) -> Any:
 
     def run(state: Any) -> Any:  # depends on all of it, or XLA would leave parts out
         after, info = bilevel.generation(state)
-        mean = bilevel.strategy.incumbent(after.es_state)
+        mean = bilevel.layout.strategy.incumbent(after.es_state)
         return info.train_steps.sum() * jnp.isfinite(mean).all()
 
     return run, (state,)

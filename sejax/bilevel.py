@@ -23,7 +23,7 @@ from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
-from sejax.generation import Candidates, GenerationEvaluator
+from sejax.generation import Candidates, GenerationEvaluator, Layout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_minus_inf, reaches
@@ -68,8 +68,8 @@ class Bilevel:
     """Algorithm 1 for one seed, as pure functions of its state; made by `make_bilevel`."""
 
     proxy: ProxyEnv
-    strategy: Strategy
-    scoring: Scoring  # the agents and the objective
+    layout: Layout  # the strategy and the agents
+    scoring: Scoring
     evaluate: GenerationEvaluator
     unravel: Callable[[Array], PyTree]  # a flat vector [dims] to the proxy's weights
     stop_when_solved: bool
@@ -88,10 +88,10 @@ class Bilevel:
         """The state before the first generation, with random weights of the proxy."""
         key_weights, key_es, key_run = jax.random.split(key, 3)
         mean, _ = ravel_pytree(self.proxy.init_weights(key_weights))
-        unknown = jnp.full(self.scoring.mixture.size, -jnp.inf)
+        unknown = jnp.full(self.layout.mixture.size, -jnp.inf)
         state = LearnState(
             key=key_run,
-            es_state=self.strategy.init(key_es, mean),
+            es_state=self.layout.strategy.init(key_es, mean),
             generation=jnp.int32(0),
             incumbent=mean,
             incumbent_score=jnp.float32(-jnp.inf),
@@ -117,11 +117,11 @@ class Bilevel:
         """The population around the incumbent, and a key for each of their trainings."""
         key = jax.random.fold_in(state.key, state.generation)
         key_ask, key_inner, key_tell = jax.random.split(key, 3)
-        population, es_state = self.strategy.ask(key_ask, state.es_state)
+        population, es_state = self.layout.strategy.ask(key_ask, state.es_state)
         return Candidates(
             population=population,
-            incumbent=self.strategy.incumbent(es_state),
-            keys=self.scoring.keys(key_inner),
+            incumbent=self.layout.strategy.incumbent(es_state),
+            keys=self.layout.keys(key_inner),
             active=~state.solved,
             test_params=self.scoring.objective.test_params(state.generation),
             key_tell=key_tell,
@@ -140,7 +140,7 @@ class Bilevel:
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
         compared = self.scoring.for_strategy(outcome)
-        es_state = self.strategy.tell(
+        es_state = self.layout.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
         scores = self.scoring.shown(outcome)
@@ -247,12 +247,12 @@ def make_bilevel(
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, mean.size)
     _require_population(strategy, mean)
-    scoring = Scoring(objective=objective, strategy=strategy, mixture=Mixture.of(agent))
+    layout, how = Layout(strategy=strategy, mixture=Mixture.of(agent)), (devices, num_parallel)
     bilevel = Bilevel(
         proxy=proxy,
-        strategy=strategy,
-        scoring=scoring,
-        evaluate=GenerationEvaluator(proxy, unravel, training, scoring, devices, num_parallel),
+        layout=layout,
+        scoring=Scoring(objective=objective, layout=layout),
+        evaluate=GenerationEvaluator(proxy, unravel, training, objective, layout, *how),
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )

@@ -3,7 +3,9 @@
 Source: paper, Algorithm 1 (TrainAgent and EvaluateAgent, for all candidates).
 """
 
+import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +14,76 @@ from flax import struct
 from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent
-from sejax.es.base import StrategyState
+from sejax.agents.mixture import Mixture
+from sejax.es.base import Strategy, StrategyState
 from sejax.evaluation import make_evaluator, tested_throughout
-from sejax.objectives import Outcome
+from sejax.objectives import Objective, Outcome
 from sejax.ops.parallel import spread_groups_over_devices
 from sejax.proxies.base import ProxyEnv
-from sejax.scoring import Scoring
 from sejax.training import TrainingConfig, num_parallel_on_cpu
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Which training of a generation belongs to which candidate and agent, and its key.
+
+    Trainings are numbered candidate by candidate, and then come those on the incumbent. So two
+    agents, two mirrored pairs of candidates (0 and 2, 1 and 3), two evaluations of each candidate
+    and two of the incumbent give:
+
+    ========= ===== ===== ===== ===== =========
+    candidate 0     1     2     3     incumbent
+    trainings 0, 1  2, 3  4, 5  6, 7  8, 9
+    agent     0     1     0     1     0, 1
+    ========= ===== ===== ===== ===== =========
+
+    Attributes:
+      strategy: how many candidates a generation has, and how often each is evaluated.
+      mixture: the agents.
+    """
+
+    strategy: Strategy
+    mixture: Mixture
+
+    @property
+    def num_incumbent_evals(self) -> int:
+        """Trainings on the incumbent, rounded up to equally many with each agent."""
+        return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
+
+    @functools.cached_property
+    def candidates_of(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the numbers of the candidates that it trains on.
+
+        Raises:
+          ConfigError: if the population is too small for the mixture.
+        """
+        return self.mixture.deal(self.strategy.population_size, self.strategy.antithetic)
+
+    @property
+    def agent_numbers(self) -> np.ndarray:
+        """The number of each training's agent, `[training]`: the last row of the table above."""
+        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
+        for agent_index, numbers in enumerate(self.candidates_of):
+            of_candidate[numbers] = agent_index
+        of_population = np.repeat(of_candidate, self.strategy.num_evals)
+        of_incumbent = np.arange(self.num_incumbent_evals) % self.mixture.size
+        return np.concatenate([of_population, of_incumbent])
+
+    def training_numbers(self, agent_index: int) -> np.ndarray:
+        """The numbers of an agent's trainings among all trainings of a generation."""
+        return np.flatnonzero(self.agent_numbers == agent_index)
+
+    def keys(self, key: Array) -> Array:
+        """A key for each training of a generation, `[training]`, from the generation's key."""
+        of_population = np.arange(self.strategy.population_size * self.strategy.num_evals)
+        of_incumbent = np.arange(self.num_incumbent_evals)
+        if self.strategy.common_random_numbers:
+            of_population = of_population % self.strategy.num_evals
+            of_incumbent = of_incumbent // self.mixture.size
+        else:
+            of_incumbent = of_incumbent + of_population.size
+        numbers = np.concatenate([of_population, of_incumbent])
+        return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
 
 @struct.dataclass
@@ -57,7 +122,8 @@ class GenerationEvaluator:
       proxy: the proxy; a candidate is a vector of its weights.
       unravel: turns a candidate into weights.
       training: how long each agent trains, and how it is tested.
-      scoring: which agent trains on which candidate, how often, and the world of test episodes.
+      objective: the world of test episodes, and whether there are tests during training.
+      layout: which agent trains on which candidate, and how often.
       devices: None for all.
       num_parallel: None: chosen for each agent.
 
@@ -76,12 +142,13 @@ class GenerationEvaluator:
         proxy: ProxyEnv,
         unravel: Callable[[Float[Array, " dims"]], PyTree],
         training: TrainingConfig,
-        scoring: Scoring,
+        objective: Objective,
+        layout: Layout,
         devices: int | None = None,
         num_parallel: int | None = None,
     ):
         self.devices = devices
-        agents, objective = scoring.mixture.agents, scoring.objective
+        agents = layout.mixture.agents
         training = tested_throughout(training) if objective.needs_tests else training
 
         def evaluator_of(agent: Agent) -> Callable[[Trainings], Outcome]:
@@ -96,11 +163,10 @@ class GenerationEvaluator:
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.num_trainings = [scoring.training_numbers(i).size for i in range(len(agents))]
-        self._scoring = scoring
-        self._spread = spread_groups_over_devices(
-            self.evaluators, devices, num_parallel, self.widths
-        )
+        self.num_trainings = [layout.training_numbers(i).size for i in range(len(agents))]
+        self._layout = layout
+        how = devices, num_parallel, self.widths
+        self._spread = spread_groups_over_devices(self.evaluators, *how)
 
     def __call__(self, candidates: Candidates) -> Outcome:
         return self.joined(self._spread([(of_agent,) for of_agent in self.trainings(candidates)]))
@@ -109,20 +175,15 @@ class GenerationEvaluator:
         """The trainings of each agent: on its candidates, and then on the incumbent."""
         shared, by_agent = (candidates.active, candidates.test_params), []
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
-        num_evals = self._scoring.strategy.num_evals
+        num_evals = self._layout.strategy.num_evals
         for agent_index, size in enumerate(self.num_trainings):
-            numbers = self._scoring.training_numbers(agent_index)
+            numbers = self._layout.training_numbers(agent_index)
             rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last
             active, test_params = jax.tree.map(
                 lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
-            trainings = Trainings(
-                key=candidates.keys[numbers],
-                weights=weights[rows],
-                active=active,
-                test_params=test_params,
-            )
-            by_agent.append(trainings)
+            keys = candidates.keys[numbers]
+            by_agent.append(Trainings(keys, weights[rows], active, test_params))
         return by_agent
 
     def joined(self, by_agent: Sequence[Outcome]) -> Outcome:
@@ -132,6 +193,6 @@ class GenerationEvaluator:
         """
         if len(by_agent) == 1:
             return by_agent[0]
-        numbers = [self._scoring.training_numbers(i) for i in range(len(by_agent))]
+        numbers = [self._layout.training_numbers(i) for i in range(len(by_agent))]
         order = np.argsort(np.concatenate(numbers))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

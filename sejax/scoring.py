@@ -6,18 +6,14 @@ one for each training. A mixture puts the first ones in one unit. An objective m
 another score (`Objective.shown`), as `MaxReward.first_eval_steps` does.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Shaped
 
-from sejax.agents.mixture import Mixture
-from sejax.es.base import Strategy
+from sejax.generation import Layout
 from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
 
@@ -76,65 +72,13 @@ class GenerationInfo:
 class Scoring:
     """How outcomes become scores, with one agent or a mixture.
 
-    Trainings are numbered candidate by candidate, and then come those on the incumbent. So two
-    agents, two mirrored pairs of candidates (0 and 2, 1 and 3), two evaluations of each candidate
-    and two of the incumbent give:
-
-    ========= ===== ===== ===== ===== =========
-    candidate 0     1     2     3     incumbent
-    trainings 0, 1  2, 3  4, 5  6, 7  8, 9
-    agent     0     1     0     1     0, 1
-    ========= ===== ===== ===== ===== =========
-
     Attributes:
       objective: the score of one outcome.
-      strategy: how many candidates a generation has, and how often each is evaluated.
-      mixture: the agents.
+      layout: which training belongs to which candidate and agent.
     """
 
     objective: Objective
-    strategy: Strategy
-    mixture: Mixture
-
-    @property
-    def num_incumbent_evals(self) -> int:
-        """Trainings on the incumbent, rounded up to equally many with each agent."""
-        return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
-
-    @functools.cached_property
-    def candidates_of(self) -> tuple[np.ndarray, ...]:
-        """For each agent, the numbers of the candidates that it trains on.
-
-        Raises:
-          ConfigError: if the population is too small for the mixture.
-        """
-        return self.mixture.deal(self.strategy.population_size, self.strategy.antithetic)
-
-    @property
-    def agent_numbers(self) -> np.ndarray:
-        """The number of each training's agent, `[training]`: the last row of the table above."""
-        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
-        for agent_index, numbers in enumerate(self.candidates_of):
-            of_candidate[numbers] = agent_index
-        of_population = np.repeat(of_candidate, self.strategy.num_evals)
-        of_incumbent = np.arange(self.num_incumbent_evals) % self.mixture.size
-        return np.concatenate([of_population, of_incumbent])
-
-    def training_numbers(self, agent_index: int) -> np.ndarray:
-        """The numbers of an agent's trainings among all trainings of a generation."""
-        return np.flatnonzero(self.agent_numbers == agent_index)
-
-    def keys(self, key: Array) -> Array:
-        """A key for each training of a generation, `[training]`, from the generation's key."""
-        of_population = np.arange(self.strategy.population_size * self.strategy.num_evals)
-        of_incumbent = np.arange(self.num_incumbent_evals)
-        if self.strategy.common_random_numbers:
-            of_population = of_population % self.strategy.num_evals
-            of_incumbent = of_incumbent // self.mixture.size
-        else:
-            of_incumbent = of_incumbent + of_population.size
-        numbers = np.concatenate([of_population, of_incumbent])
-        return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
+    layout: Layout
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
@@ -144,9 +88,13 @@ class Scoring:
         """
         scores = self._scores(self.objective(outcome))
         # nan if the agent of one evaluation diverged
-        aggregate = jnp.mean if self.strategy.eval_aggregate == "mean" else jnp.min
-        population = aggregate(scores.population.reshape(-1, self.strategy.num_evals), axis=1)
-        return self.mixture.comparable(population, self.candidates_of, scores.agent_means)
+        aggregate = jnp.mean if self.layout.strategy.eval_aggregate == "mean" else jnp.min
+        population = aggregate(
+            scores.population.reshape(-1, self.layout.strategy.num_evals), axis=1
+        )
+        return self.layout.mixture.comparable(
+            population, self.layout.candidates_of, scores.agent_means
+        )
 
     def shown(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
@@ -180,17 +128,17 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        means, num_in_population = [], scores.size - self.num_incumbent_evals
+        means, num_in_population = [], scores.size - self.layout.num_incumbent_evals
         population, incumbent = jnp.split(scores, [num_in_population])
-        for agent_index in range(self.mixture.size):
-            numbers = self.training_numbers(agent_index)
+        for agent_index in range(self.layout.mixture.size):
+            numbers = self.layout.training_numbers(agent_index)
             on_incumbent = numbers[numbers >= num_in_population] - num_in_population
             of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
             repaired, mean = with_diverged_last(*of_agent)
             incumbent = incumbent.at[on_incumbent].set(repaired)
             means.append(mean)
         agent_means = jnp.stack(means)
-        aggregate = jnp.mean if self.mixture.aggregate == "mean" else jnp.min
+        aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
             incumbent=incumbent,
@@ -203,7 +151,7 @@ class Scoring:
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
         """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
-        by_agent = map(self.training_numbers, range(self.mixture.size))
+        by_agent = map(self.layout.training_numbers, range(self.layout.mixture.size))
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
 
 

@@ -256,7 +256,7 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     after, info = jax.eval_shape(program.generation, state)
     types = [[(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(x)] for x in (state, after)]
     assert types[0] == types[1]
-    strategy = program.strategy
+    strategy = program.layout.strategy
     num_population = strategy.population_size * strategy.num_evals
     assert info.population_scores.shape == (num_population,)
     assert info.train_steps.shape == info.real_steps.shape == (sum(program.evaluate.num_trainings),)

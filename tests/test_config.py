@@ -118,8 +118,7 @@ def test_agents_as_learned_are_random_where_those_of_the_run_were(tmp_path):
         config = evaluation([f"proxy={proxy.path}"])
         (tmp_path / "printed.yaml").write_text(yaml.safe_dump(config.plain()))
         assert evaluation([f"preset={tmp_path}/printed.yaml"]) == config
-        worlds = worlds_of(config).values()
-        assert {world.is_varied for world in worlds} == {hparams == "varied"}
+        assert {x.is_varied for x in worlds_of(config).values()} == {hparams == "varied"}
 
 
 def test_evaluate_takes_one_of_several_learned_agents_with_its_fields_and_others_by_default():

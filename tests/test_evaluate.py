@@ -81,9 +81,9 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
 
 @pytest.mark.parametrize("world", ["the proxy", "the real task"])
 def test_one_agent_in_one_world_has_no_deviation(world, room, tmp_path, capsys):
-    is_real, where = world == "the real task", f"out_dir={tmp_path}"
-    words = "proxy=real env=gridworld_2x2" if is_real else f"proxy={room} baseline=false"
-    evaluate(evaluate_config(*words.split(), *ROOM, "num_agents=1", where))
+    real = "proxy=real env=gridworld_2x2"
+    words = real if world == "the real task" else f"proxy={room} baseline=false"
+    evaluate(evaluate_config(*words.split(), *ROOM, "num_agents=1", f"out_dir={tmp_path}"))
     printed = capsys.readouterr().out
     assert "nan" not in printed and "1 fresh q_learning agents" in printed
     (row,) = pd.read_csv(tmp_path / "evaluation.csv").to_dict("records")

@@ -13,7 +13,7 @@ from sejax import envs
 from sejax.agents.mixture import Mixture
 from sejax.es.evosax import EvosaxConfig
 from sejax.es.nes import NESConfig
-from sejax.objectives import MaxReward
+from sejax.generation import Layout
 from sejax.ops.scores import finite_mean
 from sejax.scoring import Scoring, with_diverged_last
 
@@ -24,16 +24,16 @@ def scoring_of(config, num_agents=1):
     """The scoring of a strategy, with agents that are never run."""
     task = envs.make("gridworld_2x2")
     agents = (sejax.make_agent(sejax.QLearningConfig(), task),) * num_agents
-    parts = {"objective": MaxReward().make(task), "mixture": Mixture(agents=agents)}
-    return Scoring(strategy=config.make(6), **parts)
+    layout = Layout(strategy=config.make(6), mixture=Mixture(agents=agents))
+    return Scoring(objective=sejax.MaxReward().make(task), layout=layout)
 
 
 @pytest.mark.parametrize("cls", [NESConfig, EvosaxConfig])
 def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
     config = cls(population_size=4, num_evals=2, num_incumbent_evals=3)
     for shared in (False, True):
-        scoring = scoring_of(dataclasses.replace(config, common_random_numbers=shared))
-        size, keys = scoring.strategy.population_size, scoring.keys(jax.random.key(0))
+        layout = scoring_of(dataclasses.replace(config, common_random_numbers=shared)).layout
+        size, keys = layout.strategy.population_size, layout.keys(jax.random.key(0))
         seeds = np.asarray(jax.random.key_data(keys))
         assert len(seeds) == 2 * size + 3
         assert len(np.unique(seeds, axis=0)) == (3 if shared else len(seeds))
@@ -43,7 +43,7 @@ def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
 
 def test_with_common_random_numbers_all_agents_of_a_mixture_have_the_populations():
     fields = {"num_evals": 2, "num_incumbent_evals": 6, "common_random_numbers": True}
-    keys = scoring_of(NESConfig(population_size=2, **fields), 2).keys(jax.random.key(0))
+    keys = scoring_of(NESConfig(population_size=2, **fields), 2).layout.keys(jax.random.key(0))
     assert (keys[8:12] == keys[jnp.array([6, 6, 7, 7])]).all()  # the population's are 0 to 7
 
 

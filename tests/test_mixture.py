@@ -54,7 +54,7 @@ def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
 def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
     bilevel = make_bilevel(task=TASK, agent=mixture(num), es=NESConfig(num_incumbent_evals=asked))
-    assert bilevel.scoring.num_incumbent_evals == evals
+    assert bilevel.layout.num_incumbent_evals == evals
 
 
 @pytest.mark.parametrize(("make", "field"), [
@@ -175,7 +175,7 @@ def test_a_generation_tells_the_advantages_over_each_agents_incumbent(two):
     assert (np.asarray(after.es_state.mean) != two.before.es_state.mean).any()
     means = [scores[12:][agent[12:] == i].mean() for i in range(2)]
     advantage = scores[:12].reshape(6, 2).mean(axis=1) - np.array(means)[[0, 1, 0, 0, 1, 0]]
-    told = two.bilevel.strategy.tell(
+    told = two.bilevel.layout.strategy.tell(
         candidates.key_tell, candidates.population, jnp.float32(advantage), jnp.float32(0),
         candidates.es_state,
     )  # fmt: skip

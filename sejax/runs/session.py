@@ -153,7 +153,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
         return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
-    first_agent, names = bilevel.scoring.mixture.agents[0], bilevel.scoring.mixture.names
+    first_agent, names = bilevel.layout.mixture.agents[0], bilevel.layout.mixture.names
     discount = first_agent.discount(first_agent.hparams)
     # A proxy does not depend on the tracker, nor on the machines.
     config = {k: v for k, v in directory.settings.items() if k not in ("tracker", "machines")}
