@@ -74,7 +74,7 @@ def test_what_is_fixed_or_has_a_range_of_its_own_is_left_out_of_the_preset(tmp_p
 
 
 def test_each_agent_of_a_mixture_has_its_own_ranges():
-    search = search_config.plan_of(["agents=[ddqn,ppo]", "space=agent"])
+    search = search_config.plan_of(["agents=[ddqn,ppo]", "space=agent", "es.name=nes"])
     assert {"agents.ddqn.tau", "agents.ppo.clip_ratio"} <= set(search.space)
 
 

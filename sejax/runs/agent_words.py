@@ -68,7 +68,7 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
         mixture = dict(file.pop("mixture", {}))
         weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in keys}
         if len(keys) > 1:
-            file["mixture"] = mixture | {"weights": weights}
+            file |= {"mixture": mixture | {"weights": weights}} if mixture or weights else {}
             file.pop("agent", None)
     return file
 
@@ -88,8 +88,8 @@ def settled(tree: Tree, names: Mapping[str, str], imports: Collection[str]) -> T
     for field, value in flatten(fields).items() if len(names) > 1 else ():
         classes = {key: registry.find("agent", name, imports) for key, name in names.items()}
         having = [key for key, x in classes.items() if field.split(".")[0] in defaults_of(x)]
-        fix = f"Set agents.{(having or [key])[0]}.{field}={shortened(value)}."
-        raise ConfigError(f"agent.{field}", "must be one agent's", got=value, fix=fix)
+        fix = f"Set agents.{(having or [key])[0]}.{field:.40}={shortened(value, 40)}."
+        raise ConfigError(f"agent.{field:.40}", "must be one agent's", got=value, fix=fix)
     others = {name: x for name, x in tree.items() if name != "agent"}
     return others | {"agents": merge(tree["agents"], {key: fields})}
 

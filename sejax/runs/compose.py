@@ -58,7 +58,7 @@ def words(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             field = shortened(name.strip("- ") or "NAME")
-            is_field = name.startswith("-") or "." in name or name in registry.GROUPS
+            is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS
             value = f"{field}={shortened(text) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)

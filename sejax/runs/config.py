@@ -176,8 +176,8 @@ class CommandConfig(Options, ABC):
         trees, imports = compose.trees_of(overrides, cls.groups()), compose.plugin_paths(overrides)
         layers = cls.layers_below(merge(*trees), imports)
         names = agent_words.names_of(merge(*layers.values())["agents"])
-        settled = (agent_words.settled(tree, names, imports) for tree in trees)
-        return layers | {"typed": merge(*settled)}
+        settled = [agent_words.settled(tree, names, imports) for tree in reversed(trees)]
+        return layers | {"typed": merge(*reversed(settled))}
 
     @classmethod
     def of_tree(cls, tree: Tree, imports: Collection[str] | None) -> Self:
@@ -194,7 +194,7 @@ class CommandConfig(Options, ABC):
         unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
         for name in flatten(unknown) or unknown:
             is_idle = name.partition(".")[0] in of_run
-            require(not is_idle, name, "has no effect in this command. Leave it out.")
+            require(not is_idle, shortened(name, 40), "has no effect here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 

@@ -126,11 +126,11 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
     by_name, known = {x.partition("=")[0]: x for x in overrides}, defaults_of(StudyConfig)
-    is_own = {name: name.partition(".")[0] in known for name in by_name}
-    texts = {name: x.partition("=")[2] for name, x in by_name.items() if not is_own[name]}
+    of_run = [name for name in by_name if name.partition(".")[0] not in known]
+    texts = {name: by_name[name].partition("=")[2] for name in of_run}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
     others = compose.words([x for name, x in by_name.items() if name not in ranges])
-    own = {name: others.pop(name) for name in [*others] if is_own[name]}
+    own = {name: others.pop(name) for name in [*others] if name.partition(".")[0] in known}
     for name, text in ranges.items():
         require(name not in ONE_VALUE, name, "must be one value in a search", got=text, use="VALUE")
     for name, text in (ranges | others).items():
