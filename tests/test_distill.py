@@ -181,7 +181,8 @@ def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
 def test_a_preset_files_values_stand_before_the_defaults(tmp_path):
     (file := tmp_path / "x.yaml").write_text("{env: pendulum, agent: ppo, training.max_steps: 777}")
     config = DistillConfig.of_words([f"preset={file}"])
-    assert (*config.agents, config.training.max_steps, config.preset) == ("ppo", 777, "distilled")
+    found = (*config.agents, config.training.max_steps, config.preset, config.agent.rollout_steps)
+    assert found == ("ppo", 777, "distilled", 256)
     assert "td3" in DistillConfig.of_words([f"preset={file}", "agents=[ppo,td3]"]).agents
     file.write_text("{env: pendulum, agent_hparams: varied}")  # which students have not
     assert refused(DistillConfig.of_words, [f"preset={file}"]) == "agent_hparams"

@@ -81,8 +81,7 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(room, tmp_path, 
 
 @pytest.mark.parametrize("world", ["the proxy", "the real task"])
 def test_one_agent_in_one_world_has_no_deviation(world, room, tmp_path, capsys):
-    real = "proxy=real env=gridworld_2x2"
-    words = real if world == "the real task" else f"proxy={room} baseline=false"
+    words = {"the proxy": f"proxy={room} baseline=false"}.get(world, "proxy=real env=gridworld_2x2")
     evaluate(evaluate_config(*words.split(), *ROOM, "num_agents=1", f"out_dir={tmp_path}"))
     printed = capsys.readouterr().out
     assert "nan" not in printed and "1 fresh q_learning agents" in printed
