@@ -2,12 +2,15 @@
 
 import dataclasses
 import functools
+import json
+import sys
+from pathlib import Path
 
 import chex
 import jax
 import jax.numpy as jnp
 import pytest
-from support import assert_equal, large_ops_in_loops, paper_se, paper_training
+from support import assert_equal, large_ops_in_loops, paper_se, paper_training, printed
 
 from sejax import envs
 from sejax.agents.dqn import DDQN, DDQNConfig
@@ -15,6 +18,7 @@ from sejax.options import registry
 from sejax.proxies.reward import RewardConfig
 from sejax.training import TrainingConfig, make_trainer
 
+ROOT = Path(__file__).parents[1]
 CAPACITY = 7919  # rows of the replay buffer
 MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program is nearly as long
 
@@ -115,3 +119,15 @@ def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     train = make_trainer(agent, env, paper_training(max_episodes=100, stop_rule="never"))
     program = str(jax.make_jaxpr(train)(jax.random.key(0), env.default_params))
     assert "f32[20000," in program and "f32[1000000," not in program
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_gpus_measures_and_writes_its_result(tmp_path):
+    path = tmp_path / "gpu.json"
+    said = printed(sys.executable, ROOT / "benchmarks/gpu.py", "--quick", "--json", path)
+    result = json.loads(path.read_text())
+    zeros = "largest_difference_of_weights", "visits_of_the_host", "copies_of_large_arrays"
+    assert result["checks"] == dict.fromkeys(zeros, 0)
+    (row,) = result["figures"]
+    assert row["agents"] == 16 and row["steps"] == 16 * 64 and row["steps_per_s"] > 0
+    assert "quick DDQN trains" in said
