@@ -94,7 +94,7 @@ class FreshAgentsConfig(CommandConfig):
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
         if stored:
-            learned = learned_agents(stored.config, imports, is_as_learned)
+            learned = learned_layer(stored.config, imports, is_as_learned)
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
             are_same = names in ({}, agent_words.names_of(learned["agents"]))
@@ -113,8 +113,8 @@ class FreshAgentsConfig(CommandConfig):
         return {"proxy": {"agents": {key: like(known, key, name) for key, name in names.items()}}}
 
 
-def learned_agents(config: Mapping[str, Any], imports: Collection[str], is_to_train: bool) -> Tree:
-    """The agents that a proxy was learned with, and what they need; empty if one is not known.
+def learned_layer(config: Mapping[str, Any], imports: Collection[str], is_to_train: bool) -> Tree:
+    """The layer of the agents that a proxy was learned with; empty if one of them is not known.
 
     Args:
       config: of the proxy's file.
@@ -137,7 +137,7 @@ def learned_agents(config: Mapping[str, Any], imports: Collection[str], is_to_tr
 
 
 def like(known: Mapping[str, Tree], key: str, name: str) -> Tree:
-    """An agent with the hyperparameters of a known one of its name, best of its key."""
+    """An agent with the hyperparameters of the known one of its name; of several, of its key."""
     same = {k: agent for k, agent in known.items() if agent["name"] == name}
     return same.get(key) or next(iter(same.values()), {"name": name})
 
