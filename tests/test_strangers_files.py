@@ -116,6 +116,7 @@ PRESETS = [
     {"agents": {"ppo": {"name": IMPORTED}}},
     {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
     {"es.score_transform": IMPORTED}, {"tracker": IMPORTED}, {"policy": IMPORTED},
+    {"es.score_transform": f"'{IMPORTED}'"}, {"agents": f"[ddqn, '{IMPORTED}']"},
     {"es.score_transform": IMPORTED.encode()}, {"policy": IMPORTED.encode()},  # !!binary
 ]  # fmt: skip
 

@@ -12,7 +12,7 @@ card.md, students.csv and search.csv into run_dir. The same command resumes wher
 """
 
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, option, registry, require
+from sejax.options import Count, registry, require
 from sejax.options.plain import defaults_of, flatten, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -71,7 +71,7 @@ class DistillConfig(CommandConfig):
     env: registry.Makes[envs.Task] = plugin("env")
     preset: str = "distilled"
     run_dir: str | None = None
-    policy: str | None = option(None, names_code=True)
+    policy: str | None = None
     copy: CopyConfig = CopyConfig()
     search: PolicySearchConfig = PolicySearchConfig()
     independent_starts: bool = False
@@ -89,7 +89,7 @@ class DistillConfig(CommandConfig):
             self.require_learning(key, "training", self.training, ONE_STEP, spec)
 
     @classmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
         """The settings of a run with this preset that are fields here, and those of the task.
 
         One-step SEs have trainings and students of their own. Searches leave out the task's reward
@@ -97,7 +97,7 @@ class DistillConfig(CommandConfig):
         """
         known = defaults_of(cls)
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
-        env = configuration.env_in(typed.get("env", {}), imports)
+        env = configuration.env_in(typed.get("env", {}))
         actions = envs.spec_of(env).actions
         if not agent_words.names_of(typed["agents"]):
             typed = merge(typed, {"agents": {name: {"name": name} for name in STUDENTS[actions]}})
@@ -105,7 +105,7 @@ class DistillConfig(CommandConfig):
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
         lengths = {"max_steps": steps, "max_episodes": steps}
         search = {"alive_bonus": getattr(env, "healthy_reward", 0.0)}
-        of_run = LearnConfig.layers_below(typed, imports)
+        of_run = LearnConfig.layers_below(typed)
         below = {layer: {k: tree[k] for k in known if k in tree} for layer, tree in of_run.items()}
         return below | {"distill": {"training": lengths, "search": search}}
 

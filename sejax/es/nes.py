@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from sejax.es.base import NumMembers, Scale, Strategy, StrategyOptions
 from sejax.es.score_transforms import FIELD, TRANSFORMS, OwnTransform, transform_of
 from sejax.ops.scores import or_minus_inf
-from sejax.options import LEAST, Count, Decay, Fraction, option, registry, require_known
+from sejax.options import LEAST, Count, Decay, Fraction, registry, require_known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class NESConfig(StrategyOptions):
     step_size: Scale = 1.0
     step_size_decay: Decay = 1.0
     mirrored: bool = True
-    score_transform: str | OwnTransform = option("all_better_2", names_code=True)
+    score_transform: str | OwnTransform = "all_better_2"
     update_rule: Literal["authors", "paper"] = "authors"
     weight_decay: Fraction = 0.0
 

@@ -201,9 +201,7 @@ Decay = Annotated[float, Field(ge=LEAST, le=1)]
 Activation = Literal["tanh", "fast_tanh", "relu", "leaky_relu", "prelu"]
 
 
-def option(
-    default: Any, *, traced: bool = False, varied: str | None = None, names_code: bool = False
-) -> Any:
+def option(default: Any, *, traced: bool = False, varied: str | None = None) -> Any:
     """A dataclass field with marks.
 
     Args:
@@ -212,10 +210,8 @@ def option(
         `agent_hparams=varied`; else, and by default, it is a constant of the program. See
         `sejax.agents.traced`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
-      names_code: whether its text may be a `module:attribute`, which the user must type.
     """
-    metadata = {"traced": traced, "varied": varied, "names_code": names_code}
-    return dataclasses.field(default=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata={"traced": traced, "varied": varied})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

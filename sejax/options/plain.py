@@ -2,8 +2,7 @@
 
 `to_plain` writes a configuration as plain values: numbers, texts, None, lists, dictionaries.
 `from_plain` and, for a plugin, `configure` read it back. Pydantic converts each value to its
-field's type: `1` to a float, a list to a tuple, the text of an override to a number. Only a
-`module:attribute` that the caller allows is imported.
+field's type: `1` to a float, a list to a tuple, the text of an override to a number.
 """
 
 import dataclasses
@@ -74,15 +73,14 @@ def plugins(group: str) -> Any:
     return dataclasses.field(default_factory=dict, metadata={"plugin": group})
 
 
-def configure(
-    group: str, values: Any, imports: Collection[str] | None = None, where: str = ""
-) -> Any:
+def configure(group: str, values: Any, where: str = "") -> Any:
     """The configuration of a plugin that plain values describe: its `name`, and its fields.
+
+    Imports the module of a `module:attribute`; see `registry.require_typed`.
 
     Args:
       group: one of `sejax.options.registry.GROUPS`.
       values: plain values by field name.
-      imports: each `module:attribute` that may be imported; None: any.
       where: its name in messages; by default the group.
 
     Raises:
@@ -96,7 +94,7 @@ def configure(
     where = where or group
     require(is_choice, where, "must be a choice with its fields", got=values, use="NAME")
     with errors_of(group, where):
-        cls = registry.find(group, values["name"], imports)
+        cls = registry.find(group, values["name"])
     known = defaults_of(cls)
     fields = {k: v for k, v in values.items() if k != "name" or k in known}
     for field in [name for name in fields if name not in known]:
@@ -104,19 +102,16 @@ def configure(
         others = [x for x in built_in if field in defaults_of(registry.find(group, x))]
         message = f"is a field of {where}={', '.join(others)}. Set one of them."
         require(not others, f"{where}.{field}", message)
-    return from_plain(cls, fields, where, imports)
+    return from_plain(cls, fields, where)
 
 
-def from_plain(
-    cls: type[T], values: Mapping[str, Any], where: str, imports: Collection[str] | None = None
-) -> T:
+def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     """Inverse of `to_plain`.
 
     Args:
       cls: a dataclass.
       values: plain values by field name; missing fields have their defaults.
       where: its name in messages, as `agent` in `agent.batch_size`; may be empty.
-      imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
       ConfigError: for an unknown field, a missing one, or a value of another type.
@@ -129,10 +124,7 @@ def from_plain(
             continue
         if name not in defaults:
             raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        of_field = marks(cls, name)
-        if isinstance(value, str | bytes) and ":" in str(value) and of_field.get("names_code"):
-            registry.require_typed(full[name], str(value), imports)
-        field = _Field(full[name], defaults[name], of_field.get("plugin"), imports)
+        field = _Field(full[name], defaults[name], marks(cls, name).get("plugin"))
         fields[name] = _read(value, hints[name], field)
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
@@ -166,7 +158,6 @@ class _Field(typing.NamedTuple):
     name: str
     default: Any
     group: str | None
-    imports: Collection[str] | None  # each `module:attribute` that may be imported; None: any
 
 
 def _read(value: Any, hint: Any, field: _Field) -> Any:
@@ -180,12 +171,12 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
     if field.group:
         if isinstance(value, Mapping) and field.default is not MISSING:
             value = {"name": registry.name_of(field.group, field.default), **value}
-        return configure(field.group, value, field.imports, field.name)
+        return configure(field.group, value, field.name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
         must = f"must have fields, as {field.name}.{next(iter(defaults_of(hint)), 'name')}"
         require(isinstance(value, Mapping), field.name, must, got=repr(value), fix="Leave it out.")
         base = to_plain(field.default) if isinstance(field.default, hint) else {}
-        return from_plain(hint, base | value, field.name, field.imports)
+        return from_plain(hint, base | value, field.name)
     return _leaf(value, hint, field)
 
 

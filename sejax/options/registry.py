@@ -18,8 +18,8 @@ group         entry points            `make(...)` gives
 ============= ======================= ==============================================
 
 A name comes with sejax, is an entry point of an installed package, or is `module:attribute`, which
-imports the module. Code that reads a file says which `module:attribute` may be imported
-(`imports`): those that the user has typed, or none.
+imports the module. Code that reads a file calls `require_typed` first: what a file names is
+imported only if the user has typed it too.
 
 `sejax.options.plain` makes configurations of plain values, and writes them.
 """
@@ -154,13 +154,12 @@ def is_registered(group: str, name: str) -> bool:
     return _path_of(group, name) is not None
 
 
-def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
+def find(group: str, name: str) -> Any:
     """The dataclass that a name stands for.
 
     Args:
       group: one of `GROUPS`.
       name: see the module's docstring.
-      imports: each `module:attribute` that may be imported; None: any.
 
     Raises:
       ConfigError: for an unknown name, a module that cannot or may not be imported, or an
@@ -171,8 +170,6 @@ def find(group: str, name: str, imports: Collection[str] | None = None) -> Any:
     path = _path_of(group, name)
     if path is None and ":" not in name:
         raise unknown_name(group, name, [*names(group), *_suggestions(name)])
-    if path is None:
-        require_typed(group, name, imports)
     plugin = imported(group, path or name)
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
@@ -277,15 +274,34 @@ def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
 # --- plugins -------------------------------------------------------------------------------------
 
 
-def require_typed(field: str, path: str, imports: Collection[str] | None) -> None:
-    """Checks that `module:attribute` may be imported; imports nothing.
+def code_names(values: object) -> set[str]:
+    """Each `module:attribute` in plain values; other texts with a colon may be among them.
+
+    Example:
+      >>> code_names({"env": {"name": "my_tasks:Maze"}, "url": "http://localhost:80"})
+      {'my_tasks:Maze'}
+    """
+    return {*_CODE.findall(str(values))}
+
+
+# After the colon of an address, a time or a path no attribute can begin.
+_CODE = re.compile(r"""[^\s\[\]{}(),'"]+:(?![\d/\\])[^\s\[\]{}(),'"]+""")
+
+
+def require_typed(field: str, values: object, typed: Collection[str] = ()) -> None:
+    """Checks that plain values of a file name no code but what the user has typed.
+
+    Args:
+      field: the values' name in messages.
+      values: plain values.
+      typed: each `module:attribute` that may be imported.
 
     Raises:
-      ConfigError: if it is not one of `imports`.
+      ConfigError: for the first other one.
     """
     must = "must be typed, as names in files are never imported"
-    use = f"{shortened(path, 60)}, if you trust it"
-    require(imports is None or path in imports, field, must, got=path, use=use)
+    for path in sorted(code_names(values).difference(typed)):
+        raise ConfigError(field, must, got=path, use=f"{shortened(path, 60)}, if you trust it")
 
 
 def require_path(field: str, path: str) -> None:

@@ -126,7 +126,8 @@ def configured(group: str, values: object, where: str) -> Any:
       ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
-        return configure(group, values, ())  # type: ignore[arg-type]
+        registry.require_typed(group, values)
+        return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field, word = PLUGIN_ARGUMENTS.get(group, group), PLUGIN_WORDS.get(group, group)
     must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"

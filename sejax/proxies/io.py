@@ -230,7 +230,7 @@ def training_of(
     if agent is None or training.max_steps is None or to_plain(agent, "agent") in agents:
         return training
     registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
-    known = [configure("agent", x, ()) for x in agents if header.is_registered("agent", x)]
+    known = [configure("agent", x) for x in agents if header.is_registered("agent", x)]
     waited = max((x.steps_before_learning(*limits) for x in known), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)
     max_steps, max_episodes = training.max_steps + longer, training.max_episodes + longer

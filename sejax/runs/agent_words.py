@@ -73,20 +73,19 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
     return file
 
 
-def settled(tree: Tree, names: Mapping[str, str], imports: Collection[str]) -> Tree:
+def settled(tree: Tree, names: Mapping[str, str]) -> Tree:
     """The tree with the fields of `agent` under the only agent's key.
 
     Args:
       tree: of words, or of a file.
       names: names of the chosen agents by key.
-      imports: each `module:attribute` that may be imported.
 
     Raises:
       ConfigError: if there are such fields, and several agents.
     """
     fields, key = tree.get("agent", {}), next(iter(names))
     for field, value in flatten(fields).items() if len(names) > 1 else ():
-        classes = {key: registry.find("agent", name, imports) for key, name in names.items()}
+        classes = {key: registry.find("agent", name) for key, name in names.items()}
         having = [key for key, x in classes.items() if field.split(".")[0] in defaults_of(x)]
         fix = f"Set agents.{(having or [key])[0]}.{field:.40}={shortened(value, 40)}."
         raise ConfigError(f"agent.{field:.40}", "must be one agent's", got=value, fix=fix)

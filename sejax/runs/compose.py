@@ -153,7 +153,7 @@ def choice(fields: Mapping[str, Any], group: str) -> str:
     return str(fields.get("name", next(iter(registry.BUILT_IN[group]))))
 
 
-def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
+def preset_of(typed: Tree) -> Tree:
     """The settings of a preset, for typed choices.
 
     A section's `with_agent` may also set fields of other groups; they count only if there is one
@@ -161,7 +161,6 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
 
     Args:
       typed: the merged `trees_of`, with the names of all agents.
-      imports: each `module:attribute` that may be imported.
 
     Raises:
       ConfigError: for an unknown proxy or preset, or a preset that the task does not have.
@@ -171,7 +170,7 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
     sections = sections_of(env, proxy)
     require_known("preset", name, sections)
     section = sections[name]
-    default = registry.find("proxy", proxy, imports).default_objective
+    default = registry.find("proxy", proxy).default_objective
     objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))
     of_names = section.get("with_agent", {})
     beside = {key: of_names.get(x, {}) for key, x in names_of(typed["agents"]).items()}
@@ -184,9 +183,3 @@ def preset_of(typed: Tree, imports: Collection[str]) -> Tree:
         {"agents": {key: x.get("agent", {}) for key, x in beside.items()}},
     )
     return {key: x for key, x in settings.items() if key != "agent"}
-
-
-def plugin_paths(overrides: Sequence[str]) -> frozenset[str]:
-    """Values of words and items of lists: each `module:attribute` among them may be imported."""
-    texts = (override.partition("=")[2].strip("[]") for override in overrides)
-    return frozenset(x.strip("[]'\" ") for text in texts for x in split(text))

@@ -12,7 +12,7 @@ Example:
   >>> layers = LearnConfig.layers_of(words)  # each lies over those before it
   >>> list(layers), layers["typed"]
   (['default', 'preset=best', 'typed'], {'agents': {'ddqn': {'learning_rate': '1e-3'}}})
-  >>> LearnConfig.of_tree(merge(*layers.values()), imports=()).agents["ddqn"].learning_rate
+  >>> LearnConfig.of_tree(merge(*layers.values())).agents["ddqn"].learning_rate
   0.001
 """
 
@@ -115,12 +115,11 @@ class CommandConfig(Options, ABC):
 
     @classmethod
     @abstractmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
           typed: the tree of the words; see `sejax.runs.compose.trees_of`.
-          imports: each `module:attribute` that may be imported.
 
         Raises:
           ConfigError: for an unknown choice or preset.
@@ -167,20 +166,23 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: for an unknown group, choice or field, or a value out of range.
         """
-        layers = cls.layers_of(overrides).values()
-        return cls.of_tree(merge(*layers), compose.plugin_paths(overrides))
+        return cls.of_tree(merge(*cls.layers_of(overrides).values()))
 
     @classmethod
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
-        trees, imports = compose.trees_of(overrides, cls.groups()), compose.plugin_paths(overrides)
-        layers = cls.layers_below(merge(*trees), imports)
+        trees = compose.trees_of(overrides, cls.groups())
+        typed, imports = merge(*trees), registry.code_names(trees[-1])
+        for name, value in flatten(typed).items():
+            name = agent_words.as_typed(name, typed["agents"]).removesuffix(".name")
+            registry.require_typed(name, value, imports)
+        layers = cls.layers_below(typed)
         names = agent_words.names_of(merge(*layers.values())["agents"])
-        settled = [agent_words.settled(tree, names, imports) for tree in reversed(trees)]
+        settled = [agent_words.settled(tree, names) for tree in reversed(trees)]
         return layers | {"typed": merge(*reversed(settled))}
 
     @classmethod
-    def of_tree(cls, tree: Tree, imports: Collection[str] | None) -> Self:
+    def of_tree(cls, tree: Tree) -> Self:
         """The configuration that nested plain values describe.
 
         Raises:
@@ -190,7 +192,7 @@ class CommandConfig(Options, ABC):
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
-        config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "", imports)
+        config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "")
         unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
         for name in flatten(unknown) or unknown:
             is_idle = name.partition(".")[0] in of_run
@@ -374,14 +376,14 @@ class LearnConfig(CommandConfig):
         }
 
     @classmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
         agent_names = agent_words.names_of(typed["agents"])
         if not agent_names:
-            default = default_agent(typed.get("env", {}), imports)
+            default = default_agent(typed.get("env", {}))
             agent_names = {default: default}
         of_agents = {"agents": {key: {"name": name} for key, name in agent_names.items()}}
-        preset = compose.preset_of(merge(of_agents, typed), imports)
+        preset = compose.preset_of(merge(of_agents, typed))
         return {"default": of_agents, f"preset={preset['preset']}": preset}
 
     @property
@@ -423,20 +425,20 @@ def apart(configs: Sequence[Config]) -> list[Config]:
     return [*by_folder.values()]
 
 
-def default_agent(env: Tree, imports: Collection[str]) -> str:
+def default_agent(env: Tree) -> str:
     """The default agent of a task, of which plain values are given."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
-        return agents.default_for(envs.spec_of(env_in(env, imports)))
+        return agents.default_for(envs.spec_of(env_in(env)))
     return agents.DEFAULTS[0]
 
 
-def env_in(env: Tree, imports: Collection[str]) -> Any:
+def env_in(env: Tree) -> Any:
     """The configuration of a task, of which plain values are given.
 
     Raises:
       ConfigError: if they describe no task that may be made.
     """
-    return configure("env", {"name": compose.choice(env, "env")} | env, imports)
+    return configure("env", {"name": compose.choice(env, "env")} | env)
 
 
 def help_of(command: type[CommandConfig], about: str | None) -> Callable[[Sequence[str]], str]:
@@ -452,7 +454,7 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     overrides = [*command.granted, *compose.expand(overrides)[0]]  # the first run of a sweep
     layers, choices = command.layers_of(overrides), ("agent", *command.groups())
     tree = merge(*layers.values())
-    config = command.of_tree(tree, compose.plugin_paths(overrides))
+    config = command.of_tree(tree)
     lines = ["Choices (group=choice):"]
     for group in choices:
         prefixes = ["gymnax/ID"] if group == "env" else []
@@ -476,14 +478,16 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
 # --- from plain values ---------------------------------------------------------------------------
 
 
-def learn_config(values: Mapping[str, Any], imports: Collection[str] | None = ()) -> LearnConfig:
+def learn_config(values: Mapping[str, Any], typed: Collection[str] = ()) -> LearnConfig:
     """The configuration of a run from plain values, as `config.yaml` and proxy files hold them.
 
     Args:
       values: nested plain values. One agent may stand as `agent`.
-      imports: each `module:attribute` that may be imported; None: any.
+      typed: each `module:attribute` that may be imported.
 
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    return LearnConfig.of_tree(old.of_today(values), imports)
+    for name, value in flatten(values).items():
+        registry.require_typed(name.removesuffix(".name"), value, typed)
+    return LearnConfig.of_tree(old.of_today(values))

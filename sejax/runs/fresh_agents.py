@@ -13,7 +13,7 @@ import pandas as pd
 from sejax import agents, envs
 from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
-from sejax.options import ConfigError, Count, option, registry, require
+from sejax.options import ConfigError, Count, registry, require
 from sejax.options.plain import configure, flatten, merge, to_plain
 from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
@@ -60,8 +60,8 @@ class FreshAgentsConfig(CommandConfig):
     granted = ("proxy=RUN_DIR",)
 
     proxy: str
-    env: str | None = option(None, names_code=True)
-    proxy_kind: str | None = option(None, names_code=True)
+    env: str | None = None
+    proxy_kind: str | None = None
     agent_hparams: Literal["default", "varied", "as_learned"] = "default"
     training_from: Literal["proxy", "config"] = "proxy"
     num_agents: Count = 10
@@ -69,7 +69,7 @@ class FreshAgentsConfig(CommandConfig):
     real_training: TrainingConfig = REAL_TRAINING
 
     @classmethod
-    def layers_below(cls, typed: Tree, imports: Collection[str]) -> dict[str, Tree]:
+    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
         """What agents take from the run that learned the proxy.
 
         If no word names an agent, all of the proxy's agents train, with their exploration and the
@@ -94,7 +94,7 @@ class FreshAgentsConfig(CommandConfig):
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
         if stored:
-            learned = learned_layer(stored.config, imports, is_as_learned)
+            learned = learned_layer(stored.config, registry.code_names(typed), is_as_learned)
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
             are_same = names in ({}, agent_words.names_of(learned["agents"]))
@@ -107,18 +107,18 @@ class FreshAgentsConfig(CommandConfig):
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
         if not names:
             env = {"name": typed.get("env", "cartpole")}
-            name = agents.default_for(stored.spec) if stored else default_agent(env, imports)
+            name = agents.default_for(stored.spec) if stored else default_agent(env)
             names = {name: name}
         known = learned.get("agents", {}) if hparams is None else {}
         return {"proxy": {"agents": {key: like(known, key, name) for key, name in names.items()}}}
 
 
-def learned_layer(config: Mapping[str, Any], imports: Collection[str], is_to_train: bool) -> Tree:
+def learned_layer(config: Mapping[str, Any], typed: Collection[str], is_to_train: bool) -> Tree:
     """The layer of the agents that a proxy was learned with; empty if one of them is not known.
 
     Args:
       config: of the proxy's file.
-      imports: each `module:attribute` that the user has typed.
+      typed: each `module:attribute` that the user has typed.
       is_to_train: whether these agents are to train.
 
     Raises:
@@ -126,10 +126,10 @@ def learned_layer(config: Mapping[str, Any], imports: Collection[str], is_to_tra
     """
     explored = config.get("exploration", {"name": "none"})
     named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
-    unknown = [(group, x) for group, x in named if not header.is_registered(group, x)]
-    for group, x in unknown:
-        registry.require_typed(group, str(x.get("name")), imports if is_to_train else None)
-    if not config["agents"] or any(x.get("name") not in imports for _, x in unknown):
+    for group, x in named if is_to_train else ():
+        registry.require_typed(group, x, typed)
+    names = {str(x.get("name")) for group, x in named if not header.is_registered(group, x)}
+    if not config["agents"] or not (is_to_train or names <= {*typed}):
         return {}
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}

@@ -257,7 +257,7 @@ def outcomes_of(setup: str, share: WorkShare) -> tuple[Outcome, float]:
 def _share_programs(setup: str) -> list[tuple[int, Any]]:
     """For each agent of a run: the size of a share, and the program that computes a share."""
     # Whoever started the run has typed the names of its plugins, so all may be imported.
-    config = configuration.learn_config(json.loads(setup), imports=None)
+    config = configuration.LearnConfig.of_tree(json.loads(setup))
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
     def program_of(agent_index: int, size: int) -> Any:

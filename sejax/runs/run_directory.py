@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from sejax.ops.files import remove_leftovers, write_text
 from sejax.options import ConfigError
-from sejax.options.plain import flatten
+from sejax.options.registry import code_names
 from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
@@ -93,9 +93,8 @@ class RunDirectory(Store):
 
         These defaults change no number.
         """
-        imports = {*map(str, flatten(self.settings).values())}
         try:
-            return configuration.learn_config(stored, imports).plain()
+            return configuration.learn_config(stored, code_names(self.settings)).plain()
         except ConfigError:
             return stored
 
