@@ -188,15 +188,13 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
         """
-        known, of_run = ({x.name for x in dataclasses.fields(c)} for c in (cls, LearnConfig))
+        known = {field.name for field in dataclasses.fields(cls)}
         by_key: Any = tree.get("agents") or ()
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "")
         unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
         for name in flatten(unknown) or unknown:
-            is_idle = name.partition(".")[0] in of_run
-            require(not is_idle, shortened(name, 40), "has no effect here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 
