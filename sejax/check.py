@@ -44,10 +44,10 @@ from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
 from sejax.runs import commands, compose, fresh_agents, plots, runtime
-from sejax.runs import config as configuration
 from sejax.runs.chunks import Pool
-from sejax.runs.config import PLACES, REAL_TRAINING, MachinesConfig
-from sejax.runs.fresh_agents import FreshAgentsConfig, World
+from sejax.runs.command_config import PLACES
+from sejax.runs.config import MachinesConfig
+from sejax.runs.fresh_agents import REAL_TRAINING, FreshAgentsConfig, World
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
@@ -107,7 +107,7 @@ def main(overrides: Sequence[str]) -> None:
     findings(CheckConfig.of_words(overrides))
 
 
-help_text = configuration.help_of(CheckConfig, __doc__)
+help_text = commands.help_of(CheckConfig, __doc__)
 
 
 def check(proxy: str | Path, **fields: object) -> dict[str, Any]:

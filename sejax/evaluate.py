@@ -21,7 +21,7 @@ from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import require
 from sejax.proxies import header, hub
 from sejax.runs import commands, fresh_agents, runtime
-from sejax.runs import config as configuration
+from sejax.runs.command_config import apart
 from sejax.runs.fresh_agents import FreshAgentsConfig, World
 
 
@@ -74,7 +74,7 @@ def main(overrides: Sequence[str]) -> None:
         evaluate(config)
 
 
-help_text = configuration.help_of(EvaluateConfig, __doc__)
+help_text = commands.help_of(EvaluateConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
@@ -83,7 +83,7 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     if len(configs) == 1:
         return configs
     configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
-    return configuration.apart(configs)
+    return apart(configs)
 
 
 def evaluate(config: EvaluateConfig) -> float:

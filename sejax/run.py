@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
 from sejax.runs import commands, runtime, session
-from sejax.runs import config as configuration
+from sejax.runs.command_config import apart
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
@@ -34,7 +34,7 @@ def main(overrides: Sequence[str]) -> None:
     learn_all(configs_of(overrides))
 
 
-help_text = configuration.help_of(LearnConfig, __doc__)
+help_text = commands.help_of(LearnConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
@@ -45,7 +45,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
             is_alone, folder = config.num_seeds == 1, config.run_dir
             folder = folder if is_alone else folder and f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    return configuration.apart(runs)
+    return apart(runs)
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:

@@ -32,9 +32,9 @@ from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import agent_words, commands, runtime
-from sejax.runs import config as configuration
 from sejax.runs.agent_words import Tree
-from sejax.runs.config import PLACES, CommandConfig, LearnConfig
+from sejax.runs.command_config import PLACES, CommandConfig
+from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
 
 # The default students and how many steps they train, by kind of actions.
@@ -97,7 +97,7 @@ class DistillConfig(CommandConfig):
         """
         known = defaults_of(cls)
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
-        env = configuration.env_in(typed.get("env", {}))
+        env = env_in(typed.get("env", {}))
         actions = envs.spec_of(env).actions
         if not agent_words.names_of(typed["agents"]):
             typed = merge(typed, {"agents": {name: {"name": name} for name in STUDENTS[actions]}})
@@ -130,7 +130,7 @@ def main(overrides: Sequence[str]) -> None:
     distill(config, shlex.join(overrides))
 
 
-help_text = configuration.help_of(DistillConfig, __doc__)
+help_text = commands.help_of(DistillConfig, __doc__)
 
 
 # --- what the command does ------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from sejax.evaluation import evaluate_agents
 from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.io import fingerprint
-from sejax.runs.config import CommandConfig
+from sejax.runs.command_config import CommandConfig
 from sejax.runs.store import Store
 
 SE = tuple[ProxyEnv, PyTree]  # environment and weights

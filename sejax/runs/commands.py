@@ -1,4 +1,4 @@
-"""What the commands share: their start, exit codes, and messages."""
+"""What the commands share: their start, `--help`, exit codes, and messages."""
 
 import contextlib
 import io
@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,10 +16,10 @@ from typing import NoReturn
 
 import yaml
 
-from sejax.options import ConfigError, FailedError, place_of, require, told
+from sejax.options import ConfigError, FailedError, field_lines, place_of, registry, require, told
 from sejax.options.plain import merge
 from sejax.runs import compose, runtime
-from sejax.runs.config import CommandConfig
+from sejax.runs.command_config import CommandConfig
 
 BAD_INPUT, FAILED, INTERRUPTED, CLOSED = 2, 1, 130, 141  # as shells give SIGINT and SIGPIPE
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -60,6 +61,40 @@ def start(
             print(yaml.safe_dump_all(configs, sort_keys=False), end="")
         else:
             main(overrides)
+
+
+def help_of(command: type[CommandConfig], about: str | None) -> Callable[[Sequence[str]], str]:
+    """What `--help` prints: what the command is about, and the `help_text` of its words."""
+    return lambda overrides: f"{about}\n{help_text(command, overrides)}"
+
+
+def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
+    """The choices of each group, then the fields of the words' choices.
+
+    If a value is not the default, the layer that sets it stands beside it.
+    """
+    overrides = [*command.granted, *compose.expand(overrides)[0]]  # the first run of a sweep
+    layers, choices = command.layers_of(overrides), ("agent", *command.groups())
+    tree = merge(*layers.values())
+    config = command.of_tree(tree)
+    lines = ["Choices (group=choice):"]
+    for group in choices:
+        prefixes = ["gymnax/ID"] if group == "env" else []
+        names = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
+        lines += [textwrap.fill(f"  {group}: {names}", 98, subsequent_indent=" " * 6)]
+    lines += ["  agents: [agent,agent,...]"]
+    if "preset" in vars(config):
+        known = compose.sections_of(*(compose.choice(tree.get(x, {}), x) for x in ("env", "proxy")))
+        lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
+    lines += ["", "Fields of these choices (field=value), with their values:"]
+    classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
+    classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]
+    sources = dict[str, str]()
+    for layer, tree in layers.items():
+        sources |= dict.fromkeys(config.named(tree), "" if layer == "default" else f" ({layer})")
+    named = (*choices, *map(config.field_of, config.agents))
+    fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
+    return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:

@@ -1,10 +1,10 @@
-"""From the words that a user types to nested plain values: the first half of `runs.config`.
+"""From the words that a user types to nested plain values: the first half of `command_config`.
 
 A word is `group=choice`, `group.field=value` or `field=value`. `words` splits words into names and
-texts; `trees_of` makes a tree of them, and of the file that `preset=FILE.yaml` names. `runs.config`
-lays this tree over the layers below it: the choices that no word makes, and the preset, or the
-settings that a stored proxy was learned with. Names are checked later, when the tree becomes
-dataclasses.
+texts; `trees_of` makes a tree of them, and of the file that `preset=FILE.yaml` names.
+`command_config` lays this tree over the layers below it: the choices that no word makes, and the
+preset, or the settings that a stored proxy was learned with. Names are checked later, when the tree
+becomes dataclasses.
 
 sejax's own presets are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has
 values, and more values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy

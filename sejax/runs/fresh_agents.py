@@ -19,9 +19,12 @@ from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs import agent_words
 from sejax.runs.agent_words import Tree
-from sejax.runs.config import REAL_TRAINING, CommandConfig, default_agent
+from sejax.runs.command_config import CommandConfig
+from sejax.runs.config import default_agent
 from sejax.training import TrainingConfig
 
+# Training on the real task.
+REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 # Columns of the table: what they show, and with how many digits.
 SHOWN = {
     "return": ("test_return", 1),
