@@ -264,7 +264,7 @@ def make_bilevel(
 def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None:
     """Checks that a strategy, which may be the user's own, asks for the population that it says."""
     asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
-    shape = (strategy.population_size, mean.size)
+    shape = (strategy.num_candidates, mean.size)
     require(asked.shape == shape, "es", f"must ask for candidates {shape}", got=asked.shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
     require(least > 0, "es", "must evaluate each candidate and the incumbent", got=least)

@@ -52,7 +52,6 @@ from sejax.runs.store import Store
 from sejax.training import TrainingConfig
 
 DISCOUNTS = (0.0, 0.5, 0.9)  # beside the agents' own
-FAST = {"discrete": "ppo", "continuous": "sac"}  # by actions, the agent that often learns fastest
 # Mania et al. (2018) search the hyperparameters for each task; here all tasks share them.
 ARS: dict[str, Any] = {"num_starts": 1, "num_directions": 16, "num_top": 8, "noise_std": 0.3}
 ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
@@ -210,7 +209,7 @@ def _tuned(task: Task) -> AgentConfig:
 
     Tabular agents have none, as by default.
     """
-    name = FAST[task.actions] if task.num_states is None else agents.default_for(task)
+    name = agents.USUAL[task.actions][-1] if task.num_states is None else agents.default_for(task)
     beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
     warmup = {"warmup_episodes": int(task.num_states is None)}
     return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)

@@ -57,7 +57,7 @@ class Layout:
         Raises:
           ConfigError: if the population is too small for the mixture.
         """
-        return self.mixture.deal(self.strategy.population_size, self.strategy.antithetic)
+        return self.mixture.deal(self.strategy.num_candidates, self.strategy.antithetic)
 
     @property
     def agent_numbers(self) -> np.ndarray:
@@ -75,7 +75,7 @@ class Layout:
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""
-        of_population = np.arange(self.strategy.population_size * self.strategy.num_evals)
+        of_population = np.arange(self.strategy.num_candidates * self.strategy.num_evals)
         of_incumbent = np.arange(self.num_incumbent_evals)
         if self.strategy.common_random_numbers:
             of_population = of_population % self.strategy.num_evals

@@ -11,9 +11,9 @@ configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
-import contextlib
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
@@ -51,8 +51,8 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     """Learns a proxy for each configuration, one after the other; each has a run directory.
 
-    A run that differs from the one before only in its seed uses the same executable. After a single
-    run it prints where everything is and what to do next; after several runs, a line for each.
+    Runs that differ only in their seeds follow each other, and use the same executable. After a
+    single run it prints where everything is and what to do next; after several, a line for each.
     If it is interrupted, finished generations are saved.
 
     Returns:
@@ -63,39 +63,39 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
       FailedError: after the last run, if no search mean of some run had a finite score.
       OSError: if a file cannot be written; everything saved before is whole.
     """
+    by_program: dict[str, list[LearnConfig]] = {}
+    for config in configs:
+        program = str(config.plain() | {"seed": 0, "run_dir": None})
+        by_program.setdefault(program, []).append(config)
     # The last run of a sweep must not be refused after the others have run.
-    programs = [str(config.plain() | {"seed": 0, "run_dir": None}) for config in configs]
-    of_programs = dict(zip(programs, configs, strict=True))
-    for config in of_programs.values() if len(of_programs) > 1 else ():
+    for config, *_ in by_program.values() if len(by_program) > 1 else ():
         make_bilevel(**config.parts())
-    scores, diverged = [], []
-    with contextlib.ExitStack() as exit_stack:
-        compiled = None
-        for config, program in zip(configs, programs, strict=True):
-            with RunDirectory(config) as directory:
+    scores = dict[Path, float]()
+    diverged = list[Path]()
+    for of_program in by_program.values():
+        runtime.configure_jax()
+        with of_program[0].machines.make(of_program[0]) as chunks:
+            for config in of_program:
                 progress = RunProgress(config)
-                if program != compiled:
-                    exit_stack.close()
-                    runtime.configure_jax()
-                    chunks = exit_stack.enter_context(config.machines.make(config))
-                    compiled = program
-                summary = session.run(config, directory, chunks, progress)
-                scores.append(max(float(row["best_so_far"]) for row in directory.rows))
-                if summary["ended"] == "diverged":
-                    diverged.append(directory.folder)
-                elif len(configs) == 1:
-                    progress.finish(directory, chunks.bilevel, scores[-1])
-    if len(configs) > 1:
+                with RunDirectory(config) as directory:
+                    summary = session.run(config, directory, chunks, progress)
+                    score = max(float(row["best_so_far"]) for row in directory.rows)
+                    scores[config.folder] = score
+                    if summary["ended"] == "diverged":
+                        diverged.append(directory.folder)
+                    elif len(configs) == 1:
+                        progress.finish(directory, chunks.bilevel, score)
+    if len(scores) > 1:
         print("Best scores of the search mean:")
-        for config, score in zip(configs, scores, strict=True):
-            print(f"{score:10.1f}  {config.folder}")
+        for folder, score in scores.items():
+            print(f"{score:10.1f}  {folder}")
     if diverged:
         runs = ", ".join(map(str, diverged))
         what = f"All agents of {runs} diverged, or all on its search means: nothing was learned."
         fix = "Does the task return NaN? If it does not, set a smaller agent.learning_rate."
         anew = "Delete the folder, or set another run_dir, to begin anew."
         raise FailedError(f"{what} {fix} {anew}")
-    return scores
+    return [scores[config.folder] for config in configs]
 
 
 if __name__ == "__main__":

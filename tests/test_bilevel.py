@@ -239,7 +239,7 @@ def test_generations_beside_a_configuration_win():
 def test_what_no_learner_can_be_made_of_is_refused(part, value):
     parts = tiny(words=ROOM).parts()
     assert refused(make_learner, **parts | {part: value}) == part
-    for fault in ({"population_size": 6}, {"num_evals": 0}, {"num_incumbent_evals": 0}):
+    for fault in ({"num_candidates": 6}, {"num_evals": 0}, {"num_incumbent_evals": 0}):
         strategy = dataclasses.replace(sejax.NESConfig(population_size=4).make(138), **fault)
         assert refused(make_learner, **parts | {"es": strategy}) == "es"
 
@@ -257,7 +257,7 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     types = [[(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(x)] for x in (state, after)]
     assert types[0] == types[1]
     strategy = program.layout.strategy
-    num_population = strategy.population_size * strategy.num_evals
+    num_population = strategy.num_candidates * strategy.num_evals
     assert info.population_scores.shape == (num_population,)
     assert info.train_steps.shape == info.real_steps.shape == (sum(program.evaluate.num_trainings),)
     assert info.incumbent_mean.shape == ()

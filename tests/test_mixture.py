@@ -32,7 +32,7 @@ def mixture(num=2, weights=(), **config):
 # --- which agent trains where --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("weights", "population_size", "candidates"), [
+@pytest.mark.parametrize(("weights", "num_candidates", "candidates"), [
     # Shares 1/2, 1/3 and 1/6; after each candidate, share times candidates less those had:
     # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
     # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
@@ -43,11 +43,11 @@ def mixture(num=2, weights=(), **config):
     ((0.0, 3.0), 3, ([], [0, 1, 2])),
     ((0.0, 3.0), 1, ([], [0])),
 ])  # fmt: skip
-def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, population_size, candidates):
+def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, num_candidates, candidates):
     agents = mixture(len(weights), weights=weights)
-    assert tuple(x.tolist() for x in agents.deal(population_size)) == candidates
-    pairs = agents.deal(2 * population_size, antithetic=True)
-    mirrored = tuple(x + [population_size + i for i in x] for x in candidates)
+    assert tuple(x.tolist() for x in agents.deal(num_candidates)) == candidates
+    pairs = agents.deal(2 * num_candidates, antithetic=True)
+    mirrored = tuple(x + [num_candidates + i for i in x] for x in candidates)
     assert tuple(x.tolist() for x in pairs) == mirrored
 
 

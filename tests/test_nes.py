@@ -21,7 +21,7 @@ MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
 
 def num_trainings(strategy):
     """Trainings in a generation."""
-    return strategy.population_size * strategy.num_evals + strategy.num_incumbent_evals
+    return strategy.num_candidates * strategy.num_evals + strategy.num_incumbent_evals
 
 
 def whole_generations(strategy):
@@ -30,7 +30,7 @@ def whole_generations(strategy):
     `ask(key, state) -> (candidates, state)`, `tell(key, candidates, scores, state) -> state`. The
     evaluations of a candidate follow one another; those of the incumbent come last.
     """
-    num_evals, size = strategy.num_evals, strategy.population_size
+    num_evals, size = strategy.num_evals, strategy.num_candidates
 
     def ask(key, state):
         population, state = strategy.ask(key, state)
@@ -76,7 +76,7 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     strategy, _, _ = nes(num_evals=2)
     # 3 members, each sign evaluated twice in a row, then one incumbent for each member.
     assert candidates.shape == (3 * 2 + 3 * 2 + 3, DIMS)
-    assert (strategy.population_size, num_trainings(strategy)) == (6, 15)
+    assert (strategy.num_candidates, num_trainings(strategy)) == (6, 15)
     np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
     np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
     assert np.abs(candidates[:6] - MEAN).min() > 0

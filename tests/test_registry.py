@@ -213,7 +213,7 @@ def test_parameters_are_options_of_the_command_line(module):
                         ("env.sizes=[3,4] env.length=2", "of_[3, 4]_2.0")):  # fmt: skip
         assert sejax.config([f"env={name}:task", *words.split()]).task().name == task
     config = sejax.config([f"es={name}:search", "es.pairs=3"])
-    assert registry.make("es", config.es, 2).population_size == 6
+    assert registry.make("es", config.es, 2).num_candidates == 6
 
 
 def test_a_plugin_must_make_what_its_group_is_of(module):

@@ -33,7 +33,7 @@ def test_every_training_has_a_seed_of_its_own_unless_asked_otherwise(cls):
     config = cls(population_size=4, num_evals=2, num_incumbent_evals=3)
     for shared in (False, True):
         layout = scoring_of(dataclasses.replace(config, common_random_numbers=shared)).layout
-        size, keys = layout.strategy.population_size, layout.keys(jax.random.key(0))
+        size, keys = layout.strategy.num_candidates, layout.keys(jax.random.key(0))
         seeds = np.asarray(jax.random.key_data(keys))
         assert len(seeds) == 2 * size + 3
         assert len(np.unique(seeds, axis=0)) == (3 if shared else len(seeds))

@@ -28,7 +28,8 @@ from sejax.envs.spec import TaskSpec
 from sejax.options import ConfigError, registry, require
 from sejax.options.registry import require_part
 
-DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
+# The usual agents by actions: first a task's default, last the one that often learns fastest.
+USUAL = {"discrete": ("ddqn", "ppo"), "continuous": ("td3", "sac")}
 
 
 def names() -> list[str]:
@@ -114,9 +115,9 @@ def require_fit(
 
 
 def default_for(spec: TaskSpec) -> str:
-    """The default agent of a task: the first that fits it."""
-    known = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
-    return next(known, DEFAULTS[0])  # if none fits, `require_fit` refuses this one
+    """The default agent of a task: of networks or, if its states have numbers, a table."""
+    usual = USUAL[spec.actions][0]
+    return usual if _fits(registry.find("agent", usual), spec) else "q_learning"
 
 
 def fitting(spec: TaskSpec) -> list[str]:

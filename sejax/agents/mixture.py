@@ -95,7 +95,7 @@ class Mixture:
     def size(self) -> int:
         return len(self.agents)
 
-    def deal(self, population_size: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
+    def deal(self, num_candidates: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
         """The candidates of each agent: their numbers in the population, ascending.
 
         Each candidate in turn goes to the agent that is furthest behind its share; an agent of
@@ -105,7 +105,7 @@ class Mixture:
         Raises:
           ConfigError: if an agent with a weight gets no candidate.
         """
-        num_dealt = population_size // 2 if antithetic else population_size
+        num_dealt = num_candidates // 2 if antithetic else num_candidates
         shares = np.array(self.weights) / sum(self.weights)
         hands: list[list[int]] = [[] for _ in self.agents]
         for candidate in range(num_dealt):
@@ -114,7 +114,7 @@ class Mixture:
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
-        must = f"must be larger: {population_size} candidates do not suffice for the agents' shares"
+        must = f"must be larger: {num_candidates} candidates do not suffice for the agents' shares"
         require(are_enough, "es.population_size", must, use=size)
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)

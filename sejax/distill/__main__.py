@@ -38,7 +38,6 @@ from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
 
 # The default students and how many steps they train, by kind of actions.
-STUDENTS = {"continuous": ("td3", "sac"), "discrete": ("ddqn", "ppo")}
 STEPS = {"continuous": 10_000, "discrete": 2000}
 ONE_STEP = SyntheticConfig()  # the form of the SEs
 BEGUN = "distill"  # the entry that says whose folder it is
@@ -100,7 +99,8 @@ class DistillConfig(CommandConfig):
         env = env_in(typed.get("env", {}))
         actions = envs.spec_of(env).actions
         if not agent_words.names_of(typed["agents"]):
-            typed = merge(typed, {"agents": {name: {"name": name} for name in STUDENTS[actions]}})
+            students = {name: {"name": name} for name in agents.USUAL[actions]}
+            typed = merge(typed, {"agents": students})
         # An episode of a one-step SE has one step.
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
         lengths = {"max_steps": steps, "max_episodes": steps}

@@ -49,7 +49,7 @@ def make_from(config: TaskConfig) -> Task:
     """The task that a configuration describes, built once; its `origin` is the configuration."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
-        vars(task)["origin"] = to_plain(config, "env")
+        object.__setattr__(task, "origin", to_plain(config, "env"))
     return task
 
 

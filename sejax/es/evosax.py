@@ -118,7 +118,7 @@ def from_evosax(
       >>> def rm_es(num_dims: int, std: float = 0.05) -> Strategy:  # es=my_module:rm_es
       ...     algorithm = Rm_ES(population_size=16, solution=jnp.zeros(num_dims))
       ...     return from_evosax(algorithm, algorithm.default_params.replace(std_init=std))
-      >>> rm_es(3).population_size
+      >>> rm_es(3).num_candidates
       16
     """
     params = algorithm.default_params if params is None else params
@@ -140,6 +140,6 @@ def from_evosax(
         ask=lambda key, state: algorithm.ask(key, state, params),
         tell=tell,
         incumbent=algorithm.get_mean,
-        population_size=algorithm.population_size,
+        num_candidates=algorithm.population_size,
         **fields,
     )

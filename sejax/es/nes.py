@@ -115,7 +115,7 @@ class NESConfig(StrategyOptions):
             ask=ask,
             tell=tell,
             incumbent=lambda state: state.mean,
-            population_size=2 * num_noises if self.mirrored else num_noises,
+            num_candidates=2 * num_noises if self.mirrored else num_noises,
             antithetic=self.mirrored,
             num_incumbent_evals=self.num_incumbent_evals or num_noises,
             **self.shared(),

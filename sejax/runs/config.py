@@ -183,7 +183,7 @@ def default_agent(env: Tree) -> str:
     """The default agent of a task, of which plain values are given."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
         return agents.default_for(envs.spec_of(env_in(env)))
-    return agents.DEFAULTS[0]
+    return compose.choice({}, "agent")
 
 
 def env_in(env: Tree) -> Any:
