@@ -18,7 +18,7 @@ from sejax.gym.tasks import Env, Info, RealTask, signature
 from sejax.options import Fraction, checked, require, shortened
 from sejax.options.plain import configure
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import Header, check_tensors, is_registered, read
+from sejax.proxies.header import Header, check_tensors, configured, is_registered, read
 from sejax.proxies.reward import RewardConfig
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
@@ -68,7 +68,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if weighs_info or self.config.augmented:  # the task's configuration has the keys
             must = "must be of a task with a registered name, which says what info the RN reads"
             require(is_registered("env", header.config["env"]), "source", must, got=header.task)
-            spec = envs.spec_of(configure("env", header.config["env"]))
+            spec = envs.spec_of(configured("env", header.config["env"], "source"))
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
         _require_task(env, header)

@@ -23,7 +23,7 @@ from sejax.envs.spec import TaskSpec
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, require_known, shortened, told
-from sejax.options.plain import configure, from_plain, to_plain
+from sejax.options.plain import from_plain, to_plain
 from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.header import Header, Stored, check_tensors
@@ -230,7 +230,8 @@ def training_of(
     if agent is None or training.max_steps is None or to_plain(agent, "agent") in agents:
         return training
     registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
-    known = [configure("agent", x) for x in agents if header.is_registered("agent", x)]
+    registered = [x for x in agents if header.is_registered("agent", x)]
+    known = [header.configured("agent", x, env.name) for x in registered]
     waited = max((x.steps_before_learning(*limits) for x in known), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - waited)
     max_steps, max_episodes = training.max_steps + longer, training.max_episodes + longer
