@@ -143,7 +143,7 @@ class Bilevel:
         es_state = self.layout.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        scores = self.scoring.shown(outcome)
+        scores = self.scoring.reported(outcome)
         score, agent_means = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(
@@ -247,12 +247,13 @@ def make_bilevel(
     mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, mean.size)
     _require_population(strategy, mean)
-    layout, how = Layout(strategy=strategy, mixture=Mixture.of(agent)), (devices, num_parallel)
+    layout = Layout(strategy=strategy, mixture=Mixture.of(agent))
+    where = {"devices": devices, "num_parallel": num_parallel}
     bilevel = Bilevel(
         proxy=proxy,
         layout=layout,
         scoring=Scoring(objective=objective, layout=layout),
-        evaluate=GenerationEvaluator(proxy, unravel, training, objective, layout, *how),
+        evaluate=GenerationEvaluator(proxy, unravel, training, objective, layout, **where),
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )

@@ -106,7 +106,7 @@ def main(overrides: Sequence[str]) -> None:
     findings(CheckConfig.of_words(overrides))
 
 
-help_text = commands.help_of(CheckConfig, __doc__)
+help_text = functools.partial(commands.help_of, CheckConfig, __doc__)
 
 
 def check(proxy: str | Path, **fields: object) -> dict[str, Any]:

@@ -9,6 +9,7 @@ Writes evaluation.csv and .json into out_dir. --print-config prints the configur
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Sequence
@@ -74,7 +75,7 @@ def main(overrides: Sequence[str]) -> None:
         evaluate(config)
 
 
-help_text = commands.help_of(EvaluateConfig, __doc__)
+help_text = functools.partial(commands.help_of, EvaluateConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:

@@ -341,8 +341,9 @@ def evaluate_agents(
     task: Task,
     training: TrainingConfig,
     keys: Array,
-    num_parallel: int | None = None,
+    *,
     devices: int | None = None,
+    num_parallel: int | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
@@ -355,7 +356,7 @@ def evaluate_agents(
     shape = jax.random.key_data(keys).shape if hasattr(keys, "dtype") else ()
     require(len(shape) == 2, "keys", "must be several", use="jax.random.split(key, 20)")
     env = env.bare if isinstance(env, ProxyEnv) else env
-    program = _evaluation_program(for_keys(agent, keys), env, task, training, num_parallel, devices)
+    program = _evaluation_program(for_keys(agent, keys), env, task, training, devices, num_parallel)
     return program(keys, env_params)
 
 
@@ -365,8 +366,8 @@ def _evaluation_program(
     env: Environment,
     task: Task,
     training: TrainingConfig,
-    num_parallel: int | None,
     devices: int | None,
+    num_parallel: int | None,
 ) -> Callable[[Array, PyTree], Outcome]:
     """The compiled program of `evaluate_agents`: `(keys, env_params) -> Outcome`."""
     evaluate = make_evaluator(agent, env, task, training, in_batches=False)
@@ -374,6 +375,7 @@ def _evaluation_program(
     def program(keys: Array, env_params: PyTree) -> PyTree:
         width = num_parallel_on_cpu(agent, training, keys.shape[0])
         train = functools.partial(evaluate, env_params=env_params)
-        return spread_over_devices(train, devices, num_parallel, width)(keys)
+        counts = {"num_devices": devices, "num_parallel": num_parallel}
+        return spread_over_devices(train, cpu_num_parallel=width, **counts)(keys)
 
     return jax.jit(program, compiler_options=compiler_options())

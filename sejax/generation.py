@@ -59,19 +59,16 @@ class Layout:
         """
         return self.mixture.deal(self.strategy.num_candidates, self.strategy.antithetic)
 
-    @property
-    def agent_numbers(self) -> np.ndarray:
-        """The number of each training's agent, `[training]`: the last row of the table above."""
-        of_candidate = np.zeros(sum(numbers.size for numbers in self.candidates_of), int)
-        for agent_index, numbers in enumerate(self.candidates_of):
-            of_candidate[numbers] = agent_index
-        of_population = np.repeat(of_candidate, self.strategy.num_evals)
-        of_incumbent = np.arange(self.num_incumbent_evals) % self.mixture.size
-        return np.concatenate([of_population, of_incumbent])
-
-    def training_numbers(self, agent_index: int) -> np.ndarray:
-        """The numbers of an agent's trainings among all trainings of a generation."""
-        return np.flatnonzero(self.agent_numbers == agent_index)
+    @functools.cached_property
+    def trainings_of(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the numbers of its trainings, ascending; see the table above."""
+        num_evals, trainings = self.strategy.num_evals, []
+        turns = self.strategy.num_candidates * num_evals + np.arange(self.num_incumbent_evals)
+        for agent_index, candidates in enumerate(self.candidates_of):
+            on_population = np.add.outer(candidates * num_evals, np.arange(num_evals)).ravel()
+            on_incumbent = turns[agent_index :: self.mixture.size]
+            trainings.append(np.concatenate([on_population, on_incumbent]))
+        return tuple(trainings)
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""
@@ -144,6 +141,7 @@ class GenerationEvaluator:
         training: TrainingConfig,
         objective: Objective,
         layout: Layout,
+        *,
         devices: int | None = None,
         num_parallel: int | None = None,
     ):
@@ -163,10 +161,11 @@ class GenerationEvaluator:
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.num_trainings = [layout.training_numbers(i).size for i in range(len(agents))]
+        self.num_trainings = [numbers.size for numbers in layout.trainings_of]
         self._layout = layout
-        how = devices, num_parallel, self.widths
-        self._spread = spread_groups_over_devices(self.evaluators, *how)
+        self._spread = spread_groups_over_devices(
+            self.evaluators, self.widths, num_devices=devices, num_parallel=num_parallel
+        )
 
     def __call__(self, candidates: Candidates) -> Outcome:
         return self.joined(self._spread([(of_agent,) for of_agent in self.trainings(candidates)]))
@@ -176,11 +175,10 @@ class GenerationEvaluator:
         shared, by_agent = (candidates.active, candidates.test_params), []
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
         num_evals = self._layout.strategy.num_evals
-        for agent_index, size in enumerate(self.num_trainings):
-            numbers = self._layout.training_numbers(agent_index)
+        for numbers in self._layout.trainings_of:
             rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last
             active, test_params = jax.tree.map(
-                lambda x, size=size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
+                lambda x, size=numbers.size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
             )
             keys = candidates.keys[numbers]
             by_agent.append(Trainings(keys, weights[rows], active, test_params))
@@ -193,6 +191,5 @@ class GenerationEvaluator:
         """
         if len(by_agent) == 1:
             return by_agent[0]
-        numbers = [self._layout.training_numbers(i) for i in range(len(by_agent))]
-        order = np.argsort(np.concatenate(numbers))
+        order = np.argsort(np.concatenate(self._layout.trainings_of))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

@@ -76,18 +76,26 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(self, outcome: Outcome, shown: bool = False) -> Float[Array, "*agent"]:
-        """The scores that compare candidates, or those that people see; nan for diverged agents.
+    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """The scores that compare candidates; nan for diverged agents."""
+        return _checked(self.score(outcome), outcome.nonfinite)
 
-        A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
+    def reported(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """The scores that people see; nan for diverged agents."""
+        return _checked((self.shown or self.score)(outcome), outcome.nonfinite)
 
-        Raises:
-          ConfigError: unless there is a score for each agent.
-        """
-        score = (shown and self.shown) or self.score
-        scores, shape = jnp.asarray(score(outcome)), outcome.nonfinite.shape
-        require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
-        return jnp.where(outcome.nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
+
+def _checked(scores: Array, nonfinite: Bool[Array, "*agent"]) -> Float[Array, "*agent"]:
+    """The scores, with nan for diverged agents.
+
+    A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
+
+    Raises:
+      ConfigError: unless there is a score for each agent.
+    """
+    scores, shape = jnp.asarray(scores), nonfinite.shape
+    require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
+    return jnp.where(nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def main(overrides: Sequence[str]) -> None:
     learn_all(configs_of(overrides))
 
 
-help_text = commands.help_of(LearnConfig, __doc__)
+help_text = functools.partial(commands.help_of, LearnConfig, __doc__)
 
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:

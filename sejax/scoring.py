@@ -96,9 +96,9 @@ class Scoring:
             population, self.layout.candidates_of, scores.agent_means
         )
 
-    def shown(self, outcome: Outcome) -> Scores:
+    def reported(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
-        return self._scores(self.objective(outcome, shown=True))
+        return self._scores(self.objective.reported(outcome))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
@@ -130,8 +130,7 @@ class Scoring:
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
         means, num_in_population = [], scores.size - self.layout.num_incumbent_evals
         population, incumbent = jnp.split(scores, [num_in_population])
-        for agent_index in range(self.layout.mixture.size):
-            numbers = self.layout.training_numbers(agent_index)
+        for numbers in self.layout.trainings_of:
             on_incumbent = numbers[numbers >= num_in_population] - num_in_population
             of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
             repaired, mean = with_diverged_last(*of_agent)
@@ -151,7 +150,7 @@ class Scoring:
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
         """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
-        by_agent = map(self.layout.training_numbers, range(self.layout.mixture.size))
+        by_agent = self.layout.trainings_of
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
 
 

@@ -358,12 +358,7 @@ class _Loop:
         (stored, _), (key, _) = large, consts
         is_full = state.step == first_step + buffer.learns_every
         keys = _StepKeys(*step_keys(key, state.step - 1, 6))
-        agent_state = jax.lax.cond(
-            is_full & (state.episode >= self.agent.spec.learns_from),
-            partial(self.learn, buffer, stored, None, state.step, keys),
-            lambda agent_state: agent_state,
-            state.agent_state,
-        )
+        agent_state = self.learn(buffer, stored, None, state.step, keys, state, is_full)
         return large, dataclasses.replace(state, agent_state=agent_state)
 
     def learn(
@@ -373,12 +368,18 @@ class _Loop:
         transition: Transition | None,
         num_steps: Array,
         keys: _StepKeys,
-        agent_state: AgentState,
+        state: _LoopState,
+        is_due: Array | bool = True,
     ) -> AgentState:
         """One update after `num_steps`, of which the last made `transition`; of a rollout None."""
-        in_use = self.agent.batch_size(agent_state)
-        batch = buffer.batch(keys.sample, stored, num_steps, transition, in_use)
-        return self.agent.update(keys.update, agent_state, batch)
+
+        def update(agent_state: AgentState) -> AgentState:
+            in_use = self.agent.batch_size(agent_state)
+            batch = buffer.batch(keys.sample, stored, num_steps, transition, in_use)
+            return self.agent.update(keys.update, agent_state, batch)
+
+        is_due &= state.episode >= self.agent.spec.learns_from
+        return jax.lax.cond(is_due, update, lambda agent_state: agent_state, state.agent_state)
 
     def step(
         self,
@@ -408,12 +409,7 @@ class _Loop:
         stored = buffer.store(stored, state.step, transition, ended, active)
         agent_state = state.agent_state
         if learns:
-            agent_state = jax.lax.cond(
-                state.episode >= self.agent.spec.learns_from,
-                partial(self.learn, buffer, stored, transition, state.step + 1, keys),
-                lambda agent_state: agent_state,
-                agent_state,
-            )
+            agent_state = self.learn(buffer, stored, transition, state.step + 1, keys, state)
         train_steps = state.train_steps + info.get("sejax_num_steps", 1)
         state = dataclasses.replace(
             state,

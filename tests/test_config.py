@@ -18,7 +18,6 @@ from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
 from sejax.runs import commands
-from sejax.runs import config as configuration
 from sejax.runs.compose import expand
 from sejax.runs.config import LearnConfig
 from sejax.runs.fresh_agents import worlds_of
@@ -189,11 +188,11 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
 def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, overrides):
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
     values = config.plain()
-    assert configuration.learn_config(values) == config
+    assert LearnConfig.of_stored(values) == config
     assert RunDirectory(config).completed(values) == values
     if len(config.agents) == 1:  # as files had it before
         older = values | {"agent": config.plain()["agents"].popitem()[1], "agents": None}
-        assert configuration.learn_config(older) == config
+        assert LearnConfig.of_stored(older) == config
     preset = tmp_path / "config.yaml"
     preset.write_text(yaml.safe_dump(values))
     changed = sejax.config([f"preset={preset}", "generations=7"])

@@ -14,7 +14,7 @@ from experiments.common import runs, shards
 from experiments.common.statistics import mean_interval
 from sejax import envs
 from sejax.options import ConfigError
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 
 tiny_agents = tiny  # a fixture
 
@@ -44,7 +44,7 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     assert made.groupby("seed").size().to_dict() == {3: 3, 4: 3}
     pd.testing.assert_frame_equal(made[made["generation"] == 0].reset_index(drop=True), first)
     config = yaml.safe_load((tmp_path / "work/runs/seed4/config.yaml").read_text())
-    result = jax.jit(sejax.make_learner(configuration.learn_config(config)))(jax.random.key(4))
+    result = jax.jit(sejax.make_learner(LearnConfig.of_stored(config)))(jax.random.key(4))
     incumbents = made[made["seed"] == 4]["incumbent_mean"]
     np.testing.assert_allclose(incumbents, result.info.incumbent_mean, rtol=1e-6)
     stored = sejax.load_set(tmp_path / "ses.safetensors")

@@ -38,7 +38,7 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
     # Members are worth the part that is scored, incumbents whole episodes.
     ended = outcome([10.0, 200.0, -3.0], [1, 2, 3], [False, False, True])
     np.testing.assert_array_equal(objective(ended), [20.0, 400.0, np.nan])
-    np.testing.assert_array_equal(objective(ended, shown=True), [10.0, 200.0, np.nan])
+    np.testing.assert_array_equal(objective.reported(ended), [10.0, 200.0, np.nan])
     assert MaxReward().make(task()).test_params(0) is None
 
 

@@ -17,6 +17,7 @@ from sejax.agents import traced
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import ranges_of
 from sejax.options import Options, Positive, option
+from sejax.runs.commands import help_texts
 
 NAN, INF = float("nan"), float("inf")
 
@@ -77,7 +78,7 @@ def test_a_subclass_that_changes_a_default_keeps_marks_and_help_text():
     assert traced(Mine()).learning_rate == 0.5
     assert "agent.learning_rate=0.5." in str(refusal(Mine, learning_rate=0))
     assert list(ranges_of(Mine())) == ["learning_rate", "discount"]
-    assert options.help_texts(Mine) == options.help_texts(QLearningConfig) != {}
+    assert help_texts(Mine) == help_texts(QLearningConfig) != {}
 
 
 def test_numbers_of_numpy_and_jax_become_pythons():

@@ -10,6 +10,10 @@ from sejax.ops.networks import MLP
 from sejax.ops.parallel import in_batches_on_cpu, spread_groups_over_devices, spread_over_devices
 
 
+def spread(fn, num_devices, num_parallel=None):
+    return spread_over_devices(fn, num_devices=num_devices, num_parallel=num_parallel)
+
+
 def work(key, x):
     """Something that depends on both arguments and takes a different time for each element."""
     steps = jnp.int32(jnp.abs(x[0])) + 1
@@ -34,7 +38,7 @@ def assert_each_is_as_alone(results, keys, xs):
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_results_come_back_in_order_for_every_size(num_devices, num_parallel, size):
     arguments = inputs(0, size)
-    results = jax.jit(spread_over_devices(work, num_devices, num_parallel))(*arguments)
+    results = jax.jit(spread(work, num_devices, num_parallel))(*arguments)
     assert_each_is_as_alone(results, *arguments)
 
 
@@ -59,7 +63,7 @@ def train_network(key):
 def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, num_parallel):
     # Neither 5 trainings nor the shares of two devices, 3 and 1 of them, are whole batches.
     keys = jax.random.split(jax.random.key(0), size)
-    one, two = (jax.jit(spread_over_devices(train_network, n, num_parallel))(keys) for n in (1, 2))
+    one, two = (jax.jit(spread(train_network, n, num_parallel))(keys) for n in (1, 2))
     assert_equal(one, two)
     by_itself = jax.jit(train_network)(keys[-1])
     assert_close(jax.tree.map(lambda x: x[-1], one), by_itself, rtol=1e-4, atol=1e-6)
@@ -70,20 +74,20 @@ def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, num_par
 def test_groups_have_a_function_a_size_and_a_width_each(num_devices, num_parallel):
     first, (_, xs), last = (inputs(seed, size) for seed, size in enumerate((5, 1, 4)))
     functions, widths = [work, lambda x: {"scaled": 3 * x}, work], [1, None, 3]
-    spread = spread_groups_over_devices(functions, num_devices, num_parallel, widths)
-    results = jax.jit(spread)([first, (xs,), last])
+    counts = {"num_devices": num_devices, "num_parallel": num_parallel}
+    results = jax.jit(spread_groups_over_devices(functions, widths, **counts))([first, (xs,), last])
     assert_each_is_as_alone(results[0], *first)
     np.testing.assert_array_equal(results[1]["scaled"], 3 * xs)
     assert_each_is_as_alone(results[2], *last)
 
 
 def test_counts_are_from_1():
-    assert refused(spread_over_devices, work, 0) == "devices"
-    assert refused(spread_over_devices, work, None, -1) == "num_parallel"
+    assert refused(spread, work, 0) == "devices"
+    assert refused(spread, work, None, -1) == "num_parallel"
 
 
 def test_two_devices_share_the_work():
-    lowered = jax.jit(spread_over_devices(lambda x: x + 1, 2)).lower(np.ones((4, 2), np.float32))
+    lowered = jax.jit(spread(lambda x: x + 1, 2)).lower(np.ones((4, 2), np.float32))
     assert "num_partitions=2" in lowered.compile().as_text().splitlines()[0]
 
 

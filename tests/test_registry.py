@@ -20,7 +20,7 @@ from sejax import envs
 from sejax.agents import AgentConfig
 from sejax.options import registry
 from sejax.options.plain import configure, to_plain
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 
 EVERY = [(group, name) for group in registry.GROUPS for name in registry.BUILT_IN[group]]
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -122,7 +122,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
     assert offered not in sys.modules
     config = sejax.config(["env=gridworld_2x2", "agent=mine", "agent.extra=3"])
     assert (config.agent.extra, config.name("agent")) == (3, "mine")
-    assert configuration.learn_config(config.plain()) == config
+    assert LearnConfig.of_stored(config.plain()) == config
     assert registry.find("agent", "ddqn") is sejax.DDQNConfig  # a name of sejax's own stays
     assert "'Nope'" in refused("agent", "broken")
 

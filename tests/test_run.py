@@ -21,8 +21,8 @@ from support import metrics as rows
 import sejax
 from sejax import run
 from sejax.runs import commands, run_directory, runtime, session
-from sejax.runs import config as configuration
 from sejax.runs.chunks import Chunks, make_chunks
+from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
 
@@ -82,7 +82,7 @@ def test_a_run_writes_the_files_of_the_design(uninterrupted):
     assert len(rows(uninterrupted)) == 6
     stored = yaml.safe_load((uninterrupted / "config.yaml").read_text())
     words = ["generations=6", f"run_dir={uninterrupted}"]
-    assert configuration.learn_config(stored) == sejax.config([*TINY, *words])
+    assert LearnConfig.of_stored(stored) == sejax.config([*TINY, *words])
 
 
 def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
@@ -332,7 +332,7 @@ def test_an_interrupt_waits_until_files_are_written():
 def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypatch, capsys):
     words = [*TINY, f"run_dir={tmp_path}/run", "seed=1,2"]
     status, said, _ = ended(monkeypatch, capsys, START, *words, "--print-config")
-    printed = [configuration.learn_config(x) for x in yaml.safe_load_all(said)]
+    printed = [LearnConfig.of_stored(x) for x in yaml.safe_load_all(said)]
     assert status == 0 and printed == run.configs_of(words) and not (tmp_path / "run").exists()
 
 

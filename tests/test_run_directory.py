@@ -19,7 +19,7 @@ import sejax
 from sejax.ops import checksummed
 from sejax.ops.files import atomic_path
 from sejax.options import ConfigError
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import COLUMNS, RunDirectory
 
 CONFIG = sejax.config(["env=gridworld_2x2", "agent=q_learning", "seed=7", "es.noise_std=0.0124"])
@@ -114,7 +114,7 @@ def test_a_run_has_these_files(whole):
     assert lines[0] == ",".join(COLUMNS)
     third = "0.333333343"
     assert lines[2] == f"1,7,{','.join([third] * 8)},0,{2 * 2**31},1.000"
-    stored = configuration.learn_config(yaml.safe_load((whole / "config.yaml").read_text()))
+    stored = LearnConfig.of_stored(yaml.safe_load((whole / "config.yaml").read_text()))
     assert stored == dataclasses.replace(CONFIG, generations=5, run_dir=str(whole))
 
 

@@ -21,7 +21,7 @@ from sejax.distill import __main__ as distill
 from sejax.ops import checksummed
 from sejax.options import registry
 from sejax.runs import commands
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import COLUMNS
 from sejax.runs.store import Store
 from sejax.search import __main__ as search
@@ -99,7 +99,7 @@ NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
 def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreign):
-    assert isinstance(refusal(configuration.learn_config, stored(**foreign)), sejax.ConfigError)
+    assert isinstance(refusal(LearnConfig.of_stored, stored(**foreign)), sejax.ConfigError)
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
     rows = {"metrics": np.frombuffer(f"{','.join(COLUMNS)}\n".encode(), np.uint8)}

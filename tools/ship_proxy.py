@@ -28,7 +28,7 @@ import yaml
 import sejax
 from sejax.options.plain import flatten
 from sejax.proxies import header, zoo
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
 COSTS = ("generations", "agents", "train_steps", "real_steps", "cpu_s")
@@ -72,10 +72,10 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
     if path.is_dir():
         ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
         stored = yaml.safe_load((path / "config.yaml").read_text())
-        config = configuration.learn_config(stored).plain()
+        config = LearnConfig.of_stored(stored).plain()
         costs = {name: ended[name] for name in COSTS}
     elif curves.exists():
-        learned = configuration.learn_config(proxy.config)  # with the names of today
+        learned = LearnConfig.of_stored(proxy.config)  # with the names of today
         config = json.loads(json.dumps(learned.plain()))
         config |= {"seed": proxy.record["seed"], "num_seeds": 1}
         rows = pd.read_csv(curves).query("variant == @path.stem and seed == @config['seed']")

@@ -17,7 +17,8 @@ from sphinx.application import Sphinx
 
 from experiments.common.experiment import Settings
 from sejax import options
-from sejax.options import Options, help_texts
+from sejax.options import Options
+from sejax.runs.commands import help_texts
 
 BOUNDED_TYPES = {x: n for n, x in vars(options).items() if get_origin(x) is Annotated}
 

@@ -220,7 +220,7 @@ def make_program(
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
         num_parallel = num_parallel_on_cpu(agent, training)
-        spread = spread_over_devices(one, devices, cpu_num_parallel=num_parallel)
+        spread = spread_over_devices(one, num_devices=devices, cpu_num_parallel=num_parallel)
         return spread(keys, jax.numpy.asarray(groups), active)
 
     return jax.jit(program)

@@ -213,7 +213,7 @@ class Experiment:
         """The text of `--help`: all fields with their defaults."""
         settings: Any = self.settings
         full, quick = (settings.defaults({"quick": quick}) for quick in (False, True))
-        texts, lines = options.help_texts(settings), []
+        texts, lines = commands.help_texts(settings), []
         for name, value in full.items():
             default, other = as_text(value), as_text(quick[name])
             differs = f" (quick: {other})" if default != other else ""

@@ -31,7 +31,7 @@ from sejax import ICMConfig
 from sejax.options import ConfigError, Count, listed, registry, require_known
 from sejax.options.plain import flatten
 from sejax.proxies import reward
-from sejax.runs import config as configuration
+from sejax.runs.config import LearnConfig
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = tuple(x for x, shaping in reward.VARIANTS.items() if not shaping.weighs_info)
@@ -250,7 +250,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     if not path.exists():
         return None
     there = sejax.load_set(path, option="rns_dir", kind="rn")
-    made_with = _what_counts(configuration.learn_config(there.config))
+    made_with = _what_counts(LearnConfig.of_stored(there.config))
     asked = _what_counts(learning_config(settings, variant, objective))
     names = made_with.keys() | asked.keys()
     differing = sorted(name for name in names if made_with.get(name) != asked.get(name))

@@ -75,9 +75,15 @@ class DuelingDDQNConfig(DDQNConfig):
     stream_hidden_size: Count = 32
 
     def network(self, num_actions: int) -> nn.Module:
-        shared = self.feature_dim, self.hidden_size, self.num_layers
-        streams = self.stream_hidden_size, self.stream_num_layers
-        return DuelingMLP(num_actions, *shared, *streams, self.activation)
+        return DuelingMLP(
+            num_actions=num_actions,
+            feature_dim=self.feature_dim,
+            hidden_size=self.hidden_size,
+            num_layers=self.num_layers,
+            stream_hidden_size=self.stream_hidden_size,
+            stream_num_layers=self.stream_num_layers,
+            activation=self.activation,
+        )
 
     def spec(self) -> AgentSpec:
         # Under vmap its two streams make a step 1.5 times as long.

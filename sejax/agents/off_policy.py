@@ -55,8 +55,13 @@ class OffPolicyOptions(AgentOptions):
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
-        shape = self.hidden_size, self.num_layers, self.activation
-        return MLP(num_outputs, *shape, learn_prelu_slope=True)
+        return MLP(
+            num_outputs=num_outputs,
+            hidden_size=self.hidden_size,
+            num_layers=self.num_layers,
+            activation=self.activation,
+            learn_prelu_slope=True,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -200,9 +200,9 @@ class PPO(Algorithm):
         require(number <= most, "agent.num_minibatches", must, got=number, use=most)
         self.config, self.obs_dim, self.length = config, obs_dim, length
         self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
-        shape = (config.hidden_size, config.num_layers, config.activation)
-        self.actor = MLP(action_dim, *shape, learn_prelu_slope=True)
-        self.critic = MLP(1, *shape, learn_prelu_slope=True)
+        size = {"hidden_size": config.hidden_size, "num_layers": config.num_layers}
+        how = {"activation": config.activation, "learn_prelu_slope": True}
+        self.actor, self.critic = (MLP(n, **size, **how) for n in (action_dim, 1))
         self.optimizer = config.optimizer()
 
     def buffer(self) -> BufferMaker:

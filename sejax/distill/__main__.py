@@ -11,6 +11,7 @@ an SE, students train on each SE, and the SE that teaches best is kept. Writes p
 card.md, students.csv and search.csv into run_dir. The same command resumes where it stopped.
 """
 
+import functools
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -130,7 +131,7 @@ def main(overrides: Sequence[str]) -> None:
     distill(config, shlex.join(overrides))
 
 
-help_text = commands.help_of(DistillConfig, __doc__)
+help_text = functools.partial(commands.help_of, DistillConfig, __doc__)
 
 
 # --- what the command does ------------------------------------------------------------------------

@@ -174,7 +174,7 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
         return tests.returns[0], tests.num_steps[0]
 
     width = 1 if task.num_actions is None else None
-    spread = spread_over_devices(episode, devices, cpu_num_parallel=width)
+    spread = spread_over_devices(episode, num_devices=devices, cpu_num_parallel=width)
 
     def generation(key: Array, policy: Policy, number: Array | int) -> tuple[Policy, Array, Array]:
         key_directions, key_episodes, key_record = jax.random.split(key, 3)

@@ -74,9 +74,11 @@ def teach(ses: Sequence[SE], agent: Agent, config: CommandConfig, keys: Array) -
     """
     started, env = time.process_time(), ses[0][0]
     print(f"training {len(ses) * len(keys)} students ...", flush=True)
-    how = config.training, keys, config.num_parallel, config.devices
-    evaluate = functools.partial(evaluate_agents, agent, env)
-    outcomes = [evaluate(env.params(weights), env.task, *how) for _, weights in ses]
+    counts = {"devices": config.devices, "num_parallel": config.num_parallel}
+    outcomes = [
+        evaluate_agents(agent, env, env.params(weights), env.task, config.training, keys, **counts)
+        for _, weights in ses
+    ]
     outcome = jax.device_get(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *outcomes))
     returns = np.asarray(outcome.test_returns, float).mean(axis=-1)
     returns = np.where(outcome.nonfinite, np.nan, returns)

@@ -42,6 +42,7 @@ def compiler_options() -> dict[str, int] | None:
 
 def spread_over_devices(
     fn: Callable[..., PyTree],
+    *,
     num_devices: int | None = None,
     num_parallel: int | None = None,
     cpu_num_parallel: int | None = 1,
@@ -64,7 +65,9 @@ def spread_over_devices(
     Raises:
       ConfigError: if there are fewer than `num_devices` devices.
     """
-    spread = spread_groups_over_devices([fn], num_devices, num_parallel, [cpu_num_parallel])
+    spread = spread_groups_over_devices(
+        [fn], [cpu_num_parallel], num_devices=num_devices, num_parallel=num_parallel
+    )
     return lambda *args: spread([args])[0]
 
 
@@ -94,9 +97,10 @@ def _mesh(num_devices: int | None) -> Mesh:
 
 def spread_groups_over_devices(
     fns: Sequence[Callable[..., PyTree]],
-    num_devices: int | None,
-    num_parallel: int | None,
     cpu_num_parallel: Sequence[int | None],
+    *,
+    num_devices: int | None = None,
+    num_parallel: int | None = None,
 ) -> Callable[[Sequence[tuple[PyTree, ...]]], list[PyTree]]:
     """As `spread_over_devices` for several functions with a group of elements each.
 
@@ -104,9 +108,9 @@ def spread_groups_over_devices(
 
     Args:
       fns: a function of one element of each group.
+      cpu_num_parallel: as in `spread_over_devices`, for each group.
       num_devices: as in `spread_over_devices`.
       num_parallel: as in `spread_over_devices`.
-      cpu_num_parallel: as in `spread_over_devices`, for each group.
 
     Returns:
       A function of the arguments: a tuple for each group, with a leading axis over its elements.

@@ -26,9 +26,7 @@ import contextlib
 import dataclasses
 import functools
 import importlib.util
-import inspect
 import os
-import re
 import sysconfig
 import textwrap
 import traceback
@@ -309,38 +307,6 @@ def marks(cls: type, name: str) -> dict[str, Any]:
     """
     fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
-
-
-def field_lines(
-    values: Mapping[str, Any], classes: Iterable[tuple[str, type]], sources: Mapping[str, str]
-) -> str:
-    """Lines of `--help`: each field with its value, its text, and where its value comes from.
-
-    Args:
-      values: plain values by the fields' names.
-      classes: groups of fields, each with the class whose docstring has the texts.
-      sources: texts for the ends of the lines, such as the layer that sets a value.
-    """
-    of_groups = ((group, help_texts(cls).items()) for group, cls in classes)
-    texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
-    lines = []
-    for name, value in values.items():
-        text = texts.get(name, texts.get(".".join(name.split(".")[:2])))  # a key's is its field's
-        about = f"  # {text}" if text else ""
-        line = f"  {name}={as_text(value)}{about}{sources.get(name, '')}"
-        lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
-    return "\n".join(lines)
-
-
-def help_texts(cls: type) -> dict[str, str]:
-    """The texts of attributes by name, from the docstrings of a class and its bases."""
-    texts: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
-        section = re.split(r"\n\n(?=\S)", rest)[0]
-        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
-        texts |= {name: " ".join(text.split()) for name, text in entries}
-    return texts
 
 
 def as_python(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """What the commands share: their start, `--help`, exit codes, and messages."""
 
 import contextlib
+import inspect
 import io
 import os
 import re
@@ -9,14 +10,14 @@ import sys
 import textwrap
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import yaml
 
-from sejax.options import ConfigError, FailedError, field_lines, place_of, registry, require, told
+from sejax.options import ConfigError, FailedError, as_text, place_of, registry, require, told
 from sejax.options.plain import merge
 from sejax.runs import compose, runtime
 from sejax.runs.command_config import CommandConfig
@@ -63,13 +64,8 @@ def start(
             main(overrides)
 
 
-def help_of(command: type[CommandConfig], about: str | None) -> Callable[[Sequence[str]], str]:
-    """What `--help` prints: what the command is about, and the `help_text` of its words."""
-    return lambda overrides: f"{about}\n{help_text(command, overrides)}"
-
-
-def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
-    """The choices of each group, then the fields of the words' choices.
+def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence[str]) -> str:
+    """What `--help` prints: about the command, choices of each group, fields of the words' choices.
 
     If a value is not the default, the layer that sets it stands beside it.
     """
@@ -77,7 +73,7 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     layers, choices = command.layers_of(overrides), ("agent", *command.groups())
     tree = merge(*layers.values())
     config = command.of_tree(tree)
-    lines = ["Choices (group=choice):"]
+    lines = [str(about), "Choices (group=choice):"]
     for group in choices:
         prefixes = ["gymnax/ID"] if group == "env" else []
         names = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
@@ -95,6 +91,38 @@ def help_text(command: type[CommandConfig], overrides: Sequence[str]) -> str:
     named = (*choices, *map(config.field_of, config.agents))
     fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
+
+
+def field_lines(
+    values: Mapping[str, Any], classes: Iterable[tuple[str, type]], sources: Mapping[str, str]
+) -> str:
+    """Lines of `--help`: each field with its value, its text, and where its value comes from.
+
+    Args:
+      values: plain values by the fields' names.
+      classes: groups of fields, each with the class whose docstring has the texts.
+      sources: texts for the ends of the lines, such as the layer that sets a value.
+    """
+    of_groups = ((group, help_texts(cls).items()) for group, cls in classes)
+    texts = {f"{group}.{name}".lstrip("."): x for group, of_cls in of_groups for name, x in of_cls}
+    lines = []
+    for name, value in values.items():
+        text = texts.get(name, texts.get(".".join(name.split(".")[:2])))  # a key's is its field's
+        about = f"  # {text}" if text else ""
+        line = f"  {name}={as_text(value)}{about}{sources.get(name, '')}"
+        lines.append(textwrap.fill(line, 98, subsequent_indent=" " * 6, break_long_words=False))
+    return "\n".join(lines)
+
+
+def help_texts(cls: type) -> dict[str, str]:
+    """The texts of attributes by name, from the docstrings of a class and its bases."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
+        section = re.split(r"\n\n(?=\S)", rest)[0]
+        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
+        texts |= {name: " ".join(text.split()) for name, text in entries}
+    return texts
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from sejax import agents, envs
 from sejax.agents.mixture import Mixture, MixtureConfig
@@ -110,6 +110,21 @@ class LearnConfig(CommandConfig):
             agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
+    @classmethod
+    def of_stored(cls, values: Mapping[str, Any], typed: Collection[str] = ()) -> Self:
+        """The configuration that `config.yaml` and proxy files hold, as plain values.
+
+        Args:
+          values: nested plain values. One agent may stand as `agent`.
+          typed: each `module:attribute` that may be imported.
+
+        Raises:
+          ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
+        """
+        for name, value in flatten(values).items():
+            registry.require_typed(name.removesuffix(".name"), value, typed)
+        return cls.of_tree(old.of_today(values))
+
     def name(self, group: str) -> str:
         """The name of a group's choice; of agents their keys, as `ddqn+ppo`."""
         if group == "agent":
@@ -193,21 +208,3 @@ def env_in(env: Tree) -> Any:
       ConfigError: if they describe no task that may be made.
     """
     return configure("env", {"name": compose.choice(env, "env")} | env)
-
-
-# --- from plain values ---------------------------------------------------------------------------
-
-
-def learn_config(values: Mapping[str, Any], typed: Collection[str] = ()) -> LearnConfig:
-    """The configuration of a run from plain values, as `config.yaml` and proxy files hold them.
-
-    Args:
-      values: nested plain values. One agent may stand as `agent`.
-      typed: each `module:attribute` that may be imported.
-
-    Raises:
-      ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
-    """
-    for name, value in flatten(values).items():
-        registry.require_typed(name.removesuffix(".name"), value, typed)
-    return LearnConfig.of_tree(old.of_today(values))

@@ -211,8 +211,9 @@ def train(config: FreshAgentsConfig, world: World, key: str) -> dict[str, Any]:
     env, env_params, task, trainings, is_varied = world
     agent = config.agent_for(key, task, is_varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    how = trainings[key], keys, config.num_parallel, config.devices
-    outcome = jax.device_get(evaluate_agents(agent, env, env_params, task, *how))
+    counts = {"devices": config.devices, "num_parallel": config.num_parallel}
+    outcome = evaluate_agents(agent, env, env_params, task, trainings[key], keys, **counts)
+    outcome = jax.device_get(outcome)
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # one for each agent
     varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     return {"test_return": outcome.test_return, **of_agents, **varied}

@@ -28,7 +28,6 @@ from sejax.generation import Trainings
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import ConfigError, Count, FailedError, require_package, shortened, told
-from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.chunks import Chunks, Pool
 from sejax.runs.config import LearnConfig, MachinesConfig
@@ -257,11 +256,12 @@ def outcomes_of(setup: str, share: WorkShare) -> tuple[Outcome, float]:
 def _share_programs(setup: str) -> list[tuple[int, Any]]:
     """For each agent of a run: the size of a share, and the program that computes a share."""
     # Whoever started the run has typed the names of its plugins, so all may be imported.
-    config = configuration.LearnConfig.of_tree(json.loads(setup))
+    config = LearnConfig.of_tree(json.loads(setup))
     bilevel = make_bilevel(**config.parts() | {"devices": 1})
 
     def program_of(agent_index: int, size: int) -> Any:
-        spread = spread_over_devices(bilevel.evaluate.evaluators[agent_index], 1, size)
+        evaluator = bilevel.evaluate.evaluators[agent_index]
+        spread = spread_over_devices(evaluator, num_devices=1, num_parallel=size)
 
         def evaluate(sent: Trainings) -> Any:
             return spread(dataclasses.replace(sent, key=jax.random.wrap_key_data(sent.key)))

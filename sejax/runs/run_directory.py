@@ -18,7 +18,6 @@ from jaxtyping import PyTree
 from sejax.ops.files import remove_leftovers, write_text
 from sejax.options import ConfigError
 from sejax.options.registry import code_names
-from sejax.runs import config as configuration
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
@@ -94,7 +93,7 @@ class RunDirectory(Store):
         These defaults change no number.
         """
         try:
-            return configuration.learn_config(stored, code_names(self.settings)).plain()
+            return LearnConfig.of_stored(stored, code_names(self.settings)).plain()
         except ConfigError:
             return stored
 

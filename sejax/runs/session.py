@@ -52,6 +52,12 @@ def run(
     # What the clocks lack of the seconds of all sessions.
     earlier_wall_s = float(directory.last("wall_s")) - time.monotonic()
     earlier_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
+
+    def spent() -> tuple[float, float]:
+        """Wall-clock and CPU seconds of all sessions."""
+        cpu_s = time.process_time() + chunks.cpu_s
+        return earlier_wall_s + time.monotonic(), earlier_cpu_s + cpu_s
+
     state = _begin(config.seed, directory, chunks, report)
     drawn, num_trainings = time.monotonic(), sum(bilevel.evaluate.num_trainings)
     folder, first = directory.folder.resolve(), len(directory.rows)
@@ -65,9 +71,7 @@ def run(
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
-                wall_s = earlier_wall_s + time.monotonic()
-                cpu_s = earlier_cpu_s + time.process_time() + chunks.cpu_s
-                rows = directory.save(saved, info, wall_s, cpu_s)
+                rows = directory.save(saved, info, *spent())
                 save_proxies(directory, bilevel, saved, first)
             for generation in _finished(rows, info):
                 report.on_generation(generation)
@@ -76,8 +80,7 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    wall_s, cpu_s = earlier_wall_s + time.monotonic(), earlier_cpu_s + time.process_time()
-    return _summary(directory, bilevel, state, wall_s, cpu_s + chunks.cpu_s)
+    return _summary(directory, bilevel, state, *spent())
 
 
 def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:

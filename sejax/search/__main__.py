@@ -11,7 +11,7 @@ python -m sejax.run, also those of preset=FILE.yaml, but for its generations, se
 
 from collections.abc import Sequence
 
-from sejax.options import ConfigError, field_lines, require_package, told
+from sejax.options import ConfigError, require_package, told
 from sejax.options.plain import to_plain
 from sejax.runs import commands, runtime
 
@@ -45,7 +45,7 @@ def help_text(overrides: Sequence[str]) -> str:
     require_package("sejax.search", "optuna", "search")
     from sejax.search.config import StudyConfig
 
-    lines = field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})
+    lines = commands.field_lines(to_plain(StudyConfig()), [("", StudyConfig)], {})
     return f"{__doc__}\nFields, with their defaults:\n{lines}"
 
 
