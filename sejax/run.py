@@ -11,6 +11,7 @@ configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -74,11 +75,14 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     scores = dict[Path, float]()
     diverged = list[Path]()
     for of_program in by_program.values():
-        runtime.configure_jax()
-        with of_program[0].machines.make(of_program[0]) as chunks:
+        with contextlib.ExitStack() as machines:
+            chunks = None
             for config in of_program:
-                progress = RunProgress(config)
                 with RunDirectory(config) as directory:
+                    progress = RunProgress(config)
+                    if chunks is None:
+                        runtime.configure_jax()
+                        chunks = machines.enter_context(config.machines.make(config))
                     summary = session.run(config, directory, chunks, progress)
                     score = max(float(row["best_so_far"]) for row in directory.rows)
                     scores[config.folder] = score
@@ -86,10 +90,10 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                         diverged.append(directory.folder)
                     elif len(configs) == 1:
                         progress.finish(directory, chunks.bilevel, score)
-    if len(scores) > 1:
+    if len(configs) > 1:
         print("Best scores of the search mean:")
-        for folder, score in scores.items():
-            print(f"{score:10.1f}  {folder}")
+        for config in configs:
+            print(f"{scores[config.folder]:10.1f}  {config.folder}")
     if diverged:
         runs = ", ".join(map(str, diverged))
         what = f"All agents of {runs} diverged, or all on its search means: nothing was learned."

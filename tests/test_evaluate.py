@@ -217,7 +217,9 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     bare = tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
     assert refused(sejax.load_proxy(bare).learned_agents) == "agent"
-    assert refused(evaluate_config, f"proxy={bare}") == "agent"  # no other agent takes its place
+    assert (
+        refused(evaluate_config, f"proxy={bare}") == "agents.my_Agent"
+    )  # no other agent takes its place
     assert list(evaluate_config(f"proxy={bare}", "agent=sarsa").agents) == ["sarsa"]
     assert "my" not in sys.modules
 

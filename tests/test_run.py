@@ -380,13 +380,3 @@ def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, m
     status, _, err = ended(monkeypatch, capsys, START, *sweep)
     assert status == commands.FAILED and "All agents of sweep/env.reward_nan diverged" in err
     assert (tmp_path / "sweep" / "env.reward_1.0" / "proxy.safetensors").exists()
-
-
-def test_what_is_said_of_a_task_of_ones_own_can_be_typed(tmp_path, monkeypatch, capsys):
-    (tmp_path / "my_room.py").write_text(BROKEN)
-    monkeypatch.chdir(tmp_path)
-    words = [*TINY, "env=my_room:make", "env.reward=1", "generations=1", "run_dir=run"]
-    _, said, _ = ended(monkeypatch, capsys, START, *words)
-    (line,) = re.findall(r"env, params = (.*)", said)
-    env, _ = eval(line, {"sejax": sejax})
-    assert env.task.origin == {"name": "my_room:make", "reward": 1.0}

@@ -6,6 +6,7 @@ imported, or a function of Python's own that runs a shell command.
 
 import functools
 import sys
+from dataclasses import make_dataclass
 from pathlib import Path
 
 import jax
@@ -20,6 +21,7 @@ from sejax import evaluate, run
 from sejax.distill import __main__ as distill
 from sejax.ops import checksummed
 from sejax.options import registry
+from sejax.options.plain import plugin
 from sejax.runs import commands
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import COLUMNS
@@ -118,6 +120,7 @@ PRESETS = [
     {"es.score_transform": IMPORTED}, {"tracker": IMPORTED}, {"policy": IMPORTED},
     {"es.score_transform": f"'{IMPORTED}'"}, {"agents": f"[ddqn, '{IMPORTED}']"},
     {"es.score_transform": IMPORTED.encode()}, {"policy": IMPORTED.encode()},  # !!binary
+    {"es.score_transform": "strangers_module:é".encode()},
 ]  # fmt: skip
 
 
@@ -138,6 +141,12 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     assert (folder / "typed").exists()
 
 
+def test_other_texts_with_a_colon_are_taken(folder):
+    (folder / "p.yaml").write_text("run_dir: runs/env:cartpole\n")
+    assert sejax.config(["preset=p.yaml"]).run_dir == "runs/env:cartpole"
+    assert distill.DistillConfig.of_words([r"policy=ppo:models\best.zip"]).policy
+
+
 STUDIES = [
     {"env": SHELL},
     {"env": {"name": IMPORTED}},
@@ -155,6 +164,7 @@ def test_a_study_is_compared_as_text(folder, refused, stored):
 
 
 PROXIES = [x for x in FOREIGN if {"env", "proxy", "agents"} & {*x}]
+PROXIES += [{"agents": {"x": {}}}, {"exploration": {}}]  # without names
 
 
 def write_proxy(config):
@@ -170,6 +180,20 @@ def write_proxy(config):
 def test_a_proxys_file_names_no_module(folder, refused, foreign):
     write_proxy(foreign)
     refused(evaluate_command, "proxy=evil.safetensors", "agent_hparams=as_learned", "out_dir=out")
+
+
+FIELDS, OPTIONS = [("inner", object, plugin("es"))], {"frozen": True, "kw_only": True}
+Nested = make_dataclass("Nested", FIELDS, bases=(sejax.QLearningConfig,), **OPTIONS)
+
+
+def test_nor_does_it_with_a_key_of_a_preset_or_within_an_agent(folder, refused, monkeypatch):
+    (folder / "p.yaml").write_text(f"{IMPORTED}: 1\n")
+    write_proxy({"agents": {"x": {"name": IMPORTED}}})
+    refused(evaluate_command, "preset=p.yaml", "proxy=evil.safetensors")
+    monkeypatch.setitem(registry._paths("agent"), "nested", f"{__name__}:Nested")
+    write_proxy({"agents": {"x": {"name": "nested", "inner": {"name": IMPORTED}}}})
+    refused(evaluate_command, "proxy=evil.safetensors", "agent=nested")
+    assert refusal(sejax.training_of, sejax.load("evil.safetensors")[0], sejax.PPOConfig())
 
 
 @pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"env", "proxy"} & {*x}])

@@ -75,14 +75,13 @@ class DuelingDDQNConfig(DDQNConfig):
     stream_hidden_size: Count = 32
 
     def network(self, num_actions: int) -> nn.Module:
+        stream = self.mlp(1).clone(
+            hidden_size=self.stream_hidden_size, num_layers=self.stream_num_layers
+        )
         return DuelingMLP(
-            num_actions=num_actions,
-            feature_dim=self.feature_dim,
-            hidden_size=self.hidden_size,
-            num_layers=self.num_layers,
-            stream_hidden_size=self.stream_hidden_size,
-            stream_num_layers=self.stream_num_layers,
-            activation=self.activation,
+            features=self.mlp(self.feature_dim),
+            value=stream,
+            advantage=stream.clone(num_outputs=num_actions),
         )
 
     def spec(self) -> AgentSpec:

@@ -38,7 +38,7 @@ from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
 
-# The default students and how many steps they train, by kind of actions.
+# How many steps students train by default, by kind of actions.
 STEPS = {"continuous": 10_000, "discrete": 2000}
 ONE_STEP = SyntheticConfig()  # the form of the SEs
 BEGUN = "distill"  # the entry that says whose folder it is

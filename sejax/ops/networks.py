@@ -257,9 +257,8 @@ class DuelingMLP(nn.Module):
 
     .. math:: Q(s, a) = V(s) + A(s, a) - \frac{1}{|A|} \sum_{a'} A(s, a')
 
-    The shared part is an `MLP`; its linear head has `feature_dim` outputs and no activation. Each
-    stream is an `MLP` on these outputs, with `stream_num_layers` hidden layers of
-    `stream_hidden_size` units. PReLU has a learned slope for each of the three parts.
+    The streams are `MLP`s on the outputs of the shared `features`, which have no activation. PReLU
+    has a learned slope for each of the three parts.
 
     Differs: the mean is over the actions of each sample. The authors take it over the actions of
     the whole batch, so that a sample's Q values depend on the other samples of its batch.
@@ -268,19 +267,11 @@ class DuelingMLP(nn.Module):
     tables of DDQN and Dueling DDQN; `docs/reference.md` 4.2.
     """
 
-    num_actions: int
-    feature_dim: int
-    hidden_size: int
-    num_layers: int
-    stream_hidden_size: int
-    stream_num_layers: int
-    activation: str
+    features: MLP
+    value: MLP
+    advantage: MLP
 
-    @nn.compact
     def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "actions *batch"]:
-        mlp = functools.partial(MLP, activation=self.activation, learn_prelu_slope=True)
-        hidden = {"hidden_size": self.stream_hidden_size, "num_layers": self.stream_num_layers}
-        features = mlp(self.feature_dim, self.hidden_size, self.num_layers, name="features")(x)
-        value = mlp(1, **hidden, name="value")(features)  # [1, *batch]
-        advantage = mlp(self.num_actions, **hidden, name="advantage")(features)
+        features = self.features(x)
+        value, advantage = self.value(features), self.advantage(features)  # value: [1, *batch]
         return value + advantage - jnp.mean(advantage, axis=0, keepdims=True)

@@ -34,6 +34,8 @@ MISSING = dataclasses.MISSING
 NAMED = 2  # fields of a message about settings that differ
 # Our names of fields, by the names that others use.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
+# Last parts of the names of fields whose text may be a `module:attribute`.
+NAMES_CODE = ("name", "env", "policy", "proxy_kind", "score_transform")
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
 
@@ -76,7 +78,7 @@ def plugins(group: str) -> Any:
 def configure(group: str, values: Any, where: str = "") -> Any:
     """The configuration of a plugin that plain values describe: its `name`, and its fields.
 
-    Imports the module of a `module:attribute`; see `registry.require_typed`.
+    Imports the module of a `module:attribute`; see `require_typed`.
 
     Args:
       group: one of `sejax.options.registry.GROUPS`.
@@ -131,6 +133,25 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         require(is_known, full[name], "must be given; it has no default", use="VALUE")
     with errors_of(group, where):
         return cls(**fields)
+
+
+def require_typed(values: Mapping[str, Any], typed: Collection[str] = (), where: str = "") -> None:
+    """Checks that plain values of a file name no code but what the user has typed.
+
+    Args:
+      values: nested plain values.
+      typed: each `module:attribute` that may be imported.
+      where: the values' name in messages, as `agent`.
+
+    Raises:
+      ConfigError: for the first field of `NAMES_CODE` that names another one.
+    """
+    for name, value in flatten(values, f"{where}." if where else "").items():
+        text = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+        if name.rpartition(".")[2] in NAMES_CODE and ":" in text and text not in typed:
+            use = f"{shortened(text, 60)}, if you trust it"
+            must = "must be typed, as names in files are never imported"
+            raise ConfigError(name.removesuffix(".name"), must, got=text, use=use)
 
 
 def defaults_of(cls: type) -> dict[str, Any]:

@@ -18,7 +18,7 @@ group         entry points            `make(...)` gives
 ============= ======================= ==============================================
 
 A name comes with sejax, is an entry point of an installed package, or is `module:attribute`, which
-imports the module. Code that reads a file calls `require_typed` first: what a file names is
+imports the module. Code that reads a file calls `plain.require_typed` first: what a file names is
 imported only if the user has typed it too.
 
 `sejax.options.plain` makes configurations of plain values, and writes them.
@@ -30,7 +30,7 @@ import functools
 import importlib.metadata
 import inspect
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_checkable
 
@@ -162,8 +162,8 @@ def find(group: str, name: str) -> Any:
       name: see the module's docstring.
 
     Raises:
-      ConfigError: for an unknown name, a module that cannot or may not be imported, or an
-        attribute that is no plugin.
+      ConfigError: for an unknown name, a module that cannot be imported, or an attribute that is
+        no plugin.
     """
     if name in BUILT_IN[group]:
         return resolve_name(BUILT_IN[group][name])
@@ -272,36 +272,6 @@ def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
 
 
 # --- plugins -------------------------------------------------------------------------------------
-
-
-def code_names(values: object) -> set[str]:
-    """Each `module:attribute` in plain values; other texts with a colon may be among them.
-
-    Example:
-      >>> code_names({"env": {"name": "my_tasks:Maze"}, "url": "http://localhost:80"})
-      {'my_tasks:Maze'}
-    """
-    return {*_CODE.findall(str(values))}
-
-
-# After the colon of an address, a time or a path no attribute can begin.
-_CODE = re.compile(r"""[^\s\[\]{}(),'"]+:(?![\d/\\])[^\s\[\]{}(),'"]+""")
-
-
-def require_typed(field: str, values: object, typed: Collection[str] = ()) -> None:
-    """Checks that plain values of a file name no code but what the user has typed.
-
-    Args:
-      field: the values' name in messages.
-      values: plain values.
-      typed: each `module:attribute` that may be imported.
-
-    Raises:
-      ConfigError: for the first other one.
-    """
-    must = "must be typed, as names in files are never imported"
-    for path in sorted(code_names(values).difference(typed)):
-        raise ConfigError(field, must, got=path, use=f"{shortened(path, 60)}, if you trust it")
 
 
 def require_path(field: str, path: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
 from sejax.options import LARGEST, ConfigError, old, registry, require, shortened, unknown_name
-from sejax.options.plain import configure, expanded, from_plain
+from sejax.options.plain import configure, expanded, from_plain, require_typed
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -45,7 +45,8 @@ class Header:
       proxies: a record of each proxy, such as its score, generation and seed.
 
     Raises:
-      ValueError, LookupError, TypeError or ArithmeticError: for values that no file has.
+      ValueError, LookupError, TypeError, ArithmeticError or AttributeError: for values that no file
+        has.
     """
 
     format_version: int
@@ -59,8 +60,10 @@ class Header:
     def __post_init__(self) -> None:
         config = old.of_today(self.config)
         object.__setattr__(self, "config", config)
-        parts = [config["env"], config["proxy"], *config["agents"].values(), *self.proxies]
-        is_whole = self.proxies and all(isinstance(part, Mapping) for part in parts)
+        explored = config.get("exploration", {"name": "none"})
+        parts = [config["env"], config["proxy"], *config["agents"].values(), explored]
+        are_named = all(isinstance(part.get("name"), str) for part in parts)
+        is_whole = self.proxies and all(isinstance(x, Mapping) for x in self.proxies) and are_named
         if self.format_version != FORMAT_VERSION or not is_whole:
             raise ValueError(f"format {self.format_version}, or a part that is missing")
         numbers = [self.discount]
@@ -126,7 +129,7 @@ def configured(group: str, values: object, where: str) -> Any:
       ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
-        registry.require_typed(group, values)
+        require_typed(values, where=group)  # type: ignore[arg-type]
         return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field, word = PLUGIN_ARGUMENTS.get(group, group), PLUGIN_WORDS.get(group, group)

@@ -30,7 +30,16 @@ from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, errors_of, old, registry, require, shortened
-from sejax.options.plain import flatten, from_plain, merge, plugin, plugins, to_plain, unknown_field
+from sejax.options.plain import (
+    flatten,
+    from_plain,
+    merge,
+    plugin,
+    plugins,
+    require_typed,
+    to_plain,
+    unknown_field,
+)
 from sejax.proxies import ProxyConfig
 from sejax.runs import agent_words, compose
 from sejax.runs.agent_words import Tree
@@ -137,12 +146,12 @@ class CommandConfig(Options, ABC):
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
         trees = compose.trees_of(overrides, cls.groups())
-        typed, imports = merge(*trees), registry.code_names(trees[-1])
-        for name, value in flatten(typed).items():
-            name = agent_words.as_typed(name, typed["agents"]).removesuffix(".name")
-            registry.require_typed(name, value, imports)
+        typed, texts = merge(*trees), {*map(str, flatten(trees[-1]).values())}
+        require_typed(typed, texts)  # a file may have named code
         layers = cls.layers_below(typed)
-        names = agent_words.names_of(merge(*layers.values())["agents"])
+        below = merge(*layers.values())
+        require_typed(below, texts)
+        names = agent_words.names_of(below["agents"])
         settled = [agent_words.settled(tree, names) for tree in reversed(trees)]
         return layers | {"typed": merge(*reversed(settled))}
 
@@ -160,6 +169,8 @@ class CommandConfig(Options, ABC):
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "")
         unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
         for name in flatten(unknown) or unknown:
+            is_elsewhere = name.partition(".")[0] in registry.GROUPS
+            require(not is_elsewhere, shortened(name, 40), "is no field here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 

@@ -15,7 +15,7 @@ from sejax.es.base import Strategy
 from sejax.objectives import Objective
 from sejax.ops.files import as_file_name
 from sejax.options import ConfigError, Count, Options, old, registry, require, shortened
-from sejax.options.plain import configure, flatten, merge, plugin, unknown_field
+from sejax.options.plain import configure, merge, plugin, require_typed, unknown_field
 from sejax.proxies import ProxyConfig
 from sejax.runs import agent_words, compose
 from sejax.runs.agent_words import Tree
@@ -121,8 +121,7 @@ class LearnConfig(CommandConfig):
         Raises:
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
         """
-        for name, value in flatten(values).items():
-            registry.require_typed(name.removesuffix(".name"), value, typed)
+        require_typed(values, typed)
         return cls.of_tree(old.of_today(values))
 
     def name(self, group: str) -> str:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -81,8 +81,8 @@ class FreshAgentsConfig(CommandConfig):
         default one trains.
 
         Raises:
-          ConfigError: without a proxy; for agents of the proxy that are neither registered nor
-            typed; with `agent_hparams=as_learned`, if words name others, or if the file has none.
+          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words name others, or if
+            the file has none.
         """
         require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE or cartpole")
         # As --print-config has it, whose output may come as preset=FILE.yaml.
@@ -97,7 +97,7 @@ class FreshAgentsConfig(CommandConfig):
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
         if stored:
-            learned = learned_layer(stored.config, registry.code_names(typed), is_as_learned)
+            learned = learned_layer(stored.config)
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
             are_same = names in ({}, agent_words.names_of(learned["agents"]))
@@ -116,24 +116,15 @@ class FreshAgentsConfig(CommandConfig):
         return {"proxy": {"agents": {key: like(known, key, name) for key, name in names.items()}}}
 
 
-def learned_layer(config: Mapping[str, Any], typed: Collection[str], is_to_train: bool) -> Tree:
-    """The layer of the agents that a proxy was learned with; empty if one of them is not known.
+def learned_layer(config: Mapping[str, Any]) -> Tree:
+    """The layer of the agents that a proxy was learned with; empty if its file has none.
 
     Args:
       config: of the proxy's file.
-      typed: each `module:attribute` that the user has typed.
-      is_to_train: whether these agents are to train.
-
-    Raises:
-      ConfigError: if one that is to train is neither registered nor typed.
     """
-    explored = config.get("exploration", {"name": "none"})
-    named = [*(("agent", x) for x in config["agents"].values()), ("exploration", explored)]
-    for group, x in named if is_to_train else ():
-        registry.require_typed(group, x, typed)
-    names = {str(x.get("name")) for group, x in named if not header.is_registered(group, x)}
-    if not config["agents"] or not (is_to_train or names <= {*typed}):
+    if not config["agents"]:
         return {}
+    explored = config.get("exploration", {"name": "none"})
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}
     return {"agents": config["agents"], "exploration": explored, "real_training": real_training}

@@ -1,13 +1,11 @@
 """Lines of progress, and the final message of `sejax.run`."""
 
-import re
 import shlex
 import time
 
 from sejax.bilevel import Bilevel
 from sejax.ops.scores import reaches
 from sejax.options import registry
-from sejax.options.plain import to_plain
 from sejax.runs import compose
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
@@ -68,17 +66,13 @@ class RunProgress:
         # The user must type the names of plugins: no name in a file is imported.
         agents = {k: registry.name_of("agent", x) for k, x in self._config.agents.items()}
         is_own, proxy = any(":" in x for x in agents.values()), self._config.name("proxy")
-        env, explored = to_plain(self._config.env, "env"), self._config.name("exploration")
-        named = {"env": env["name"], "proxy_kind": proxy, "exploration": explored}
+        env, explored = self._config.name("env"), self._config.name("exploration")
+        named = {"env": env, "proxy_kind": proxy, "exploration": explored}
         typed = [f"{name}={text}" for name, text in named.items() if ":" in text]
         typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
         typed += ["agent_hparams=as_learned"] * is_own
         words = "".join(f" {shlex.quote(word)}" for word in typed)
-        texts = {k: re.sub(r"^-?inf$", r"float('\g<0>')", repr(x)) for k, x in env.items()}
-        fields = ", ".join(f"{name}={text}" for name, text in texts.items())
-        arguments = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
-        choice = to_plain(self._config.proxy, "proxy")
-        arguments += f", proxy=sejax.options.plain.configure('proxy', {choice})" * (":" in proxy)
+        arguments = ", task=YOUR_TASK" * (":" in env) + ", proxy=YOUR_CONFIG" * (":" in proxy)
         self.say(
             f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'finished'}\n"
             f"{verdict}\n\n"
