@@ -43,7 +43,7 @@ from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
-from sejax.runs import commands, compose, fresh_agents, plots, runtime
+from sejax.runs import commands, fresh_agents, plots, presets, runtime
 from sejax.runs.chunks import Pool
 from sejax.runs.command_config import PLACES
 from sejax.runs.config import MachinesConfig
@@ -210,7 +210,7 @@ def _tuned(task: Task) -> AgentConfig:
     Tabular agents have none, as by default.
     """
     name = agents.USUAL[task.actions][-1] if task.num_states is None else agents.default_for(task)
-    beside = compose.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
+    beside = presets.sections_of(task.name, "se")["best"].get("with_agent", {}).get(name, {})
     warmup = {"warmup_episodes": int(task.num_states is None)}
     return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)
 

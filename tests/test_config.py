@@ -18,10 +18,10 @@ from sejax.evaluate import EvaluateConfig
 from sejax.options import ConfigError
 from sejax.options.plain import flatten, parsed
 from sejax.runs import commands
-from sejax.runs.compose import expand
 from sejax.runs.config import LearnConfig
 from sejax.runs.fresh_agents import worlds_of
 from sejax.runs.run_directory import RunDirectory
+from sejax.runs.words import expand
 
 OWN_NAME = ["agents=[ddqn,myopic]", "agents.myopic=ddqn", "agents.myopic.discount=0"]
 

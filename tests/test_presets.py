@@ -10,7 +10,7 @@ from support import paper_training, refused
 import sejax
 from experiments.common.reward_networks import STUDIES
 from sejax.options import registry
-from sejax.runs import compose
+from sejax.runs import presets
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")
@@ -88,11 +88,11 @@ def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
-    for stem in compose.PRESETS.keys() - {compose.BASES}:
+    for stem in presets.PRESETS.keys() - {presets.BASES}:
         env, _, proxy = stem.rpartition("-")
         assert proxy in registry.names("proxy")
-        assert env in (compose.GENERAL, *registry.names("env"))
-        for section in compose.sections_of(env, proxy).values():
+        assert env in (presets.GENERAL, *registry.names("env"))
+        for section in presets.sections_of(env, proxy).values():
             for group in ("agent", "es", "objective"):
                 assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
 

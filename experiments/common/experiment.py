@@ -22,7 +22,8 @@ from sejax import options
 from sejax.ops.files import write_bytes
 from sejax.options import Count, as_text, require, require_known, shortened
 from sejax.options.plain import from_plain, parsed
-from sejax.runs import commands, compose, runtime
+from sejax.runs import commands, runtime
+from sejax.runs.words import texts_of
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 # Fields that no result depends on, and `run`.
@@ -168,7 +169,7 @@ def parse(words: Iterable[str]) -> dict[str, Any]:
     Raises:
       ConfigError: for anything else.
     """
-    texts = compose.words(list(words))
+    texts = texts_of(list(words))
     given = {name: parsed(text) for name, text in texts.items() if not name.startswith(RUN_PREFIX)}
     of_runs = [name for name in texts if name.startswith(RUN_PREFIX)]
     run = [f"{name.removeprefix(RUN_PREFIX)}={texts[name]}" for name in of_runs]

@@ -32,11 +32,11 @@ from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
-from sejax.runs import agent_words, commands, runtime
-from sejax.runs.agent_words import Tree
+from sejax.runs import commands, runtime
 from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
+from sejax.runs.words import Tree, names_of
 
 # How many steps students train by default, by kind of actions.
 STEPS = {"continuous": 10_000, "discrete": 2000}
@@ -99,7 +99,7 @@ class DistillConfig(CommandConfig):
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
         env = env_in(typed.get("env", {}))
         actions = envs.spec_of(env).actions
-        if not agent_words.names_of(typed["agents"]):
+        if not names_of(typed["agents"]):
             students = {name: {"name": name} for name in agents.USUAL[actions]}
             typed = merge(typed, {"agents": students})
         # An episode of a one-step SE has one step.

@@ -1,6 +1,6 @@
 """What commands share: from the words that a user types to typed, validated dataclasses.
 
-A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.compose` makes a tree of
+A word is `group=choice`, `group.field=value` or `field=value`. `sejax.runs.words` makes a tree of
 the words. `CommandConfig.layers_of` puts choices and presets below it. `sejax.options.plain` makes
 dataclasses of the merged layers, and reads each value by its field's type. The dataclasses check
 themselves.
@@ -8,7 +8,7 @@ themselves.
 Example:
   >>> from sejax.runs.config import LearnConfig
   >>> words = ["agent.learning_rate=1e-3"]
-  >>> compose.trees_of(words, LearnConfig.groups())
+  >>> trees_of(words, LearnConfig.groups())
   [{'agents': {}, 'agent': {'learning_rate': '1e-3'}}]
   >>> layers = LearnConfig.layers_of(words)  # each lies over those before it
   >>> list(layers), layers["typed"]
@@ -41,8 +41,7 @@ from sejax.options.plain import (
     unknown_field,
 )
 from sejax.proxies import ProxyConfig
-from sejax.runs import agent_words, compose
-from sejax.runs.agent_words import Tree
+from sejax.runs.words import Tree, as_typed, expand, names_of, settled, trees_of
 from sejax.training import TrainingConfig, require_reachable
 
 PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
@@ -93,7 +92,7 @@ class CommandConfig(Options, ABC):
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
-          typed: the tree of the words; see `sejax.runs.compose.trees_of`.
+          typed: the tree of the words; see `sejax.runs.words.trees_of`.
 
         Raises:
           ConfigError: for an unknown choice or preset.
@@ -121,7 +120,7 @@ class CommandConfig(Options, ABC):
         """
         by_name = {override.partition("=")[0]: override for override in overrides}
         overrides, configs = [*by_name.values()], []  # of words with one name the last counts
-        for of_run in compose.expand(overrides):
+        for of_run in expand(overrides):
             config = cls.of_words(of_run)
             folder = getattr(config, cls.folder_field)
             known = (cls.folder_field,) if folder else cls.named_by
@@ -145,15 +144,15 @@ class CommandConfig(Options, ABC):
     @classmethod
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
-        trees = compose.trees_of(overrides, cls.groups())
+        trees = trees_of(overrides, cls.groups())
         typed, texts = merge(*trees), {*map(str, flatten(trees[-1]).values())}
         require_typed(typed, texts)  # a file may have named code
         layers = cls.layers_below(typed)
         below = merge(*layers.values())
         require_typed(below, texts)
-        names = agent_words.names_of(below["agents"])
-        settled = [agent_words.settled(tree, names) for tree in reversed(trees)]
-        return layers | {"typed": merge(*reversed(settled))}
+        names = names_of(below["agents"])
+        typed = merge(*(settled(tree, names) for tree in trees))
+        return layers | {"typed": typed}
 
     @classmethod
     def of_tree(cls, tree: Tree) -> Self:
@@ -182,7 +181,7 @@ class CommandConfig(Options, ABC):
 
     def field_of(self, key: str) -> str:
         """The group of an agent's fields in words: `agent`, or `agents.KEY` of several."""
-        return agent_words.as_typed(f"agents.{key}", self.agents)
+        return as_typed(f"agents.{key}", self.agents)
 
     def agent_for(self, key: str, task: envs.Task, is_varied: bool) -> Agent:
         """The agent of a key, with the exploration, for a task; see `sejax.make_agent`."""
@@ -195,7 +194,7 @@ class CommandConfig(Options, ABC):
 
     def named(self, tree: Tree) -> dict[str, Any]:
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
-        flat = {agent_words.as_typed(name, self.agents): x for name, x in flatten(tree).items()}
+        flat = {as_typed(name, self.agents): x for name, x in flatten(tree).items()}
         return {name.removesuffix(".name"): x for name, x in flat.items()}
 
     def require_learning(

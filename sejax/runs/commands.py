@@ -19,8 +19,9 @@ import yaml
 
 from sejax.options import ConfigError, FailedError, as_text, place_of, registry, require, told
 from sejax.options.plain import merge
-from sejax.runs import compose, runtime
+from sejax.runs import presets, runtime
 from sejax.runs.command_config import CommandConfig
+from sejax.runs.words import expand, trees_of
 
 BAD_INPUT, FAILED, INTERRUPTED, CLOSED = 2, 1, 130, 141  # as shells give SIGINT and SIGPIPE
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -69,7 +70,7 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
 
     If a value is not the default, the layer that sets it stands beside it.
     """
-    overrides = [*command.granted, *compose.expand(overrides)[0]]  # the first run of a sweep
+    overrides = [*command.granted, *expand(overrides)[0]]  # the first run of a sweep
     layers, choices = command.layers_of(overrides), ("agent", *command.groups())
     tree = merge(*layers.values())
     config = command.of_tree(tree)
@@ -80,7 +81,7 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
         lines += [textwrap.fill(f"  {group}: {names}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if "preset" in vars(config):
-        known = compose.sections_of(*(compose.choice(tree.get(x, {}), x) for x in ("env", "proxy")))
+        known = presets.sections_of(*(presets.choice(tree.get(x, {}), x) for x in ("env", "proxy")))
         lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
@@ -139,7 +140,7 @@ def _devices(overrides: Sequence[str]) -> int | None:
     with contextlib.suppress(ConfigError):  # the command raises it later
         known = ("devices", "machines", "machines.name", "preset")  # which may tell
         overrides = [word for word in overrides if word.partition("=")[0] in known]
-        trees = [merge(*compose.trees_of(x, ["machines"])) for x in compose.expand(overrides)]
+        trees = [merge(*trees_of(x, ["machines"])) for x in expand(overrides)]
         here = [tree.get("machines", {}).get("name", "local") == "local" for tree in trees]
         counts = [str(x.get("devices", "")) if y else "1" for x, y in zip(trees, here, strict=True)]
         if all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts):

@@ -17,10 +17,10 @@ from sejax.ops.files import as_file_name
 from sejax.options import ConfigError, Count, Options, old, registry, require, shortened
 from sejax.options.plain import configure, merge, plugin, require_typed, unknown_field
 from sejax.proxies import ProxyConfig
-from sejax.runs import agent_words, compose
-from sejax.runs.agent_words import Tree
 from sejax.runs.command_config import PLACES, CommandConfig
+from sejax.runs.presets import choice, preset_of
 from sejax.runs.trackers import Tracker
+from sejax.runs.words import Tree, names_of
 
 if TYPE_CHECKING:  # which imports this module
     from sejax.runs.chunks import Chunks, Pool
@@ -159,12 +159,12 @@ class LearnConfig(CommandConfig):
     @classmethod
     def layers_below(cls, typed: Tree) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
-        agent_names = agent_words.names_of(typed["agents"])
+        agent_names = names_of(typed["agents"])
         if not agent_names:
             default = default_agent(typed.get("env", {}))
             agent_names = {default: default}
         of_agents = {"agents": {key: {"name": name} for key, name in agent_names.items()}}
-        preset = compose.preset_of(merge(of_agents, typed))
+        preset = preset_of(merge(of_agents, typed))
         return {"default": of_agents, f"preset={preset['preset']}": preset}
 
     @property
@@ -197,7 +197,7 @@ def default_agent(env: Tree) -> str:
     """The default agent of a task, of which plain values are given."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
         return agents.default_for(envs.spec_of(env_in(env)))
-    return compose.choice({}, "agent")
+    return choice({}, "agent")
 
 
 def env_in(env: Tree) -> Any:
@@ -206,4 +206,4 @@ def env_in(env: Tree) -> Any:
     Raises:
       ConfigError: if they describe no task that may be made.
     """
-    return configure("env", {"name": compose.choice(env, "env")} | env)
+    return configure("env", {"name": choice(env, "env")} | env)

@@ -17,10 +17,9 @@ from sejax.options import ConfigError, Count, registry, require
 from sejax.options.plain import configure, flatten, merge, to_plain
 from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
-from sejax.runs import agent_words
-from sejax.runs.agent_words import Tree
 from sejax.runs.command_config import CommandConfig
 from sejax.runs.config import default_agent
+from sejax.runs.words import Tree, names_of
 from sejax.training import TrainingConfig
 
 # Training on the real task.
@@ -90,7 +89,7 @@ class FreshAgentsConfig(CommandConfig):
         is_default = merge({"training": printed}, typed)["training"] == printed
         is_used = is_default or typed.get("training_from") == "config"
         require(is_used, "training", "must come with training_from=config, or be real_training.*.")
-        names, hparams = agent_words.names_of(typed["agents"]), typed.get("agent_hparams")
+        names, hparams = names_of(typed["agents"]), typed.get("agent_hparams")
         is_as_learned = hparams == "as_learned" or (not names and hparams is None)
         stored, learned = None, Tree()
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
@@ -100,7 +99,7 @@ class FreshAgentsConfig(CommandConfig):
             learned = learned_layer(stored.config)
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-            are_same = names in ({}, agent_words.names_of(learned["agents"]))
+            are_same = names in ({}, names_of(learned["agents"]))
             fix = "Set agent_hparams=default."
             require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and is_as_learned:

@@ -6,7 +6,7 @@ import time
 from sejax.bilevel import Bilevel
 from sejax.ops.scores import reaches
 from sejax.options import registry
-from sejax.runs import compose
+from sejax.runs import presets
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.trackers import FinishedGeneration
@@ -24,7 +24,7 @@ class RunProgress:
         self._config, self._started, self._steps = config, time.monotonic(), 0
         self._is_quiet = is_quiet
         env, proxy = config.name("env"), config.name("proxy")
-        if f"{env}-{proxy}" not in compose.PRESETS:
+        if f"{env}-{proxy}" not in presets.PRESETS:
             none = f"There are no tuned settings for env={env} with proxy={proxy}"
             self.say(f"{none}: these are general ones, not tuned (docs/defaults.md).")
 

@@ -11,8 +11,8 @@ from optuna.distributions import FloatDistribution
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, registry, require
 from sejax.options.plain import defaults_of, from_plain, to_plain, unknown_field
-from sejax.runs import compose
 from sejax.runs.config import LearnConfig
+from sejax.runs.words import texts_of
 from sejax.search import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
@@ -129,7 +129,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     of_run = [name for name in by_name if name.partition(".")[0] not in known]
     texts = {name: by_name[name].partition("=")[2] for name in of_run}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
-    others = compose.words([x for name, x in by_name.items() if name not in ranges])
+    others = texts_of([x for name, x in by_name.items() if name not in ranges])
     own = {name: others.pop(name) for name in [*others] if name.partition(".")[0] in known}
     for name, text in ranges.items():
         require(name not in ONE_VALUE, name, "must be one value in a search", got=text, use="VALUE")

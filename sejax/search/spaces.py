@@ -25,7 +25,7 @@ from optuna import distributions, trial
 
 from sejax.options import ConfigError, as_text, nearest, require, shortened, told
 from sejax.options.plain import parsed, split
-from sejax.runs.compose import UNREADABLE
+from sejax.runs.words import UNREADABLE
 
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a drawn number in its override: exactly this number is tried

@@ -1,0 +1,78 @@
+"""Presets: the settings of a task and proxy that were measured or published.
+
+They are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has values, and more
+values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy or objective each.
+`like` names the section that it builds on, in its file or in `bases.yaml`.
+`general-<proxy>.yaml` serves tasks without a file of their own, and sections with `like: general`.
+A user's file holds overrides.
+"""
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sejax.options import registry, require_known
+from sejax.options.plain import merge
+from sejax.runs.words import Tree, names_of
+
+# The text of sejax's own preset files, by their stems.
+FILES = sorted(Path(__file__).parents[1].glob("presets/*.yaml"))
+PRESETS = {path.stem: path.read_text(encoding="utf-8") for path in FILES}
+BASES, GENERAL = "bases", "general"  # files of sections to build on, and for tasks without a file
+
+
+@functools.cache
+def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+    """The presets of a task and proxy by name: those of its file, and those of all tasks.
+
+    Each preset includes the section that it builds on. That section must stand before it.
+    """
+    sections: dict[str, dict[str, Any]] = {"best": {}}
+    bases: dict[str, dict[str, Any]] = {}
+    for stem in (BASES, f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
+        known = bases | {GENERAL: sections["best"]}
+        for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
+            like = section.pop("like", None)
+            known[name] = merge(known[like] if like else {}, section)
+            (bases if stem == BASES else sections)[name] = known[name]
+    return sections
+
+
+def choice(fields: Mapping[str, Any], group: str) -> str:
+    """The name of a group's choice in its fields; sejax's own first one if none is typed."""
+    return str(fields.get("name", next(iter(registry.BUILT_IN[group]))))
+
+
+def preset_of(typed: Tree) -> Tree:
+    """The settings of a preset, for typed choices.
+
+    A section's `with_agent` may also set fields of other groups; they count only if there is one
+    agent.
+
+    Args:
+      typed: the merged `trees_of`, with the names of all agents.
+
+    Raises:
+      ConfigError: for an unknown proxy or preset, or a preset that the task does not have.
+    """
+    name = str(typed.get("preset", "best"))
+    env, proxy, es = (choice(typed.get(group, {}), group) for group in ("env", "proxy", "es"))
+    sections = sections_of(env, proxy)
+    require_known("preset", name, sections)
+    section = sections[name]
+    default = registry.find("proxy", proxy).default_objective
+    objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))
+    of_names = section.get("with_agent", {})
+    beside = {key: of_names.get(x, {}) for key, x in names_of(typed["agents"]).items()}
+    settings = merge(
+        {key: x for key, x in section.items() if not key.startswith("with_")},
+        section.get("with_es", {}).get(es, {}),
+        section.get("with_objective", {}).get(str(objective["name"]), {}),
+        *(beside.values() if len(beside) == 1 else ()),
+        {"objective": {"name": objective["name"]}, "preset": name},
+        {"agents": {key: x.get("agent", {}) for key, x in beside.items()}},
+    )
+    return {key: x for key, x in settings.items() if key != "agent"}

@@ -1,0 +1,209 @@
+"""From the words that a user types to trees of plain values; the notations of agents.
+
+A word is `group=choice`, `group.field=value` or `field=value`. `texts_of` splits words into names
+and texts; `trees_of` makes a tree of them, and of the file that `preset=FILE.yaml` names.
+`command_config` lays this tree over the layers below it. Names are checked later, when the tree
+becomes dataclasses. Agents have notations of their own:
+
+======================================= =======================================================
+words                                   tree
+======================================= =======================================================
+`agent=ddqn`, `agents=[ddqn,ppo]`       `{"agents": {"ddqn": {"name": "ddqn"}, ...}}`
+`agents.big=ddqn agents.big.tau=0.1`    `{"agents": {"big": {"name": "ddqn", "tau": "0.1"}}}`
+`agent.tau=0.1`, of an only agent       `{"agent": {"tau": "0.1"}}`, until its key is known; then
+                                        `{"agents": {"ddqn": {"tau": "0.1"}}}` (`settled`)
+======================================= =======================================================
+
+Messages and `--help` name an only agent's fields as in the last row (`as_typed`).
+"""
+
+import itertools
+import re
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import yaml
+
+from sejax.options import ConfigError, old, registry, require, shortened
+from sejax.options.plain import defaults_of, expanded, flatten, merge, split, unquoted
+
+Tree: TypeAlias = dict[str, Any]  # nested plain values
+NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
+# A choice may stand beside its fields, as in config.yaml.
+CHOICES = {f"{group}.name": group for group in registry.GROUPS}
+CHOOSE_ALL = {"agent", "agents"}  # words that choose all agents
+# `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
+BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
+# What reading a file of YAML may raise.
+UNREADABLE = (OSError, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError)
+
+
+def texts_of(overrides: Sequence[str]) -> dict[str, str]:
+    """Splits any command's words into names and texts; of words with one name the last counts.
+
+    Raises:
+      ConfigError: for a word that is not of the form NAME=TEXT, or has several values.
+
+    Example:
+      >>> texts_of(["env=acrobot", "agents=[ddqn,ppo]"])
+      {'env': 'acrobot', 'agents': '[ddqn,ppo]'}
+    """
+    is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
+    require(is_list, "overrides", "must be a list of text", got=overrides, use='["env=cartpole"]')
+    texts = {}
+    for override in overrides:
+        name, equals, text = override.partition("=")
+        if not (equals and NAME.fullmatch(name)):
+            field = shortened(name.strip("- ") or "NAME")
+            is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS
+            value = f"{field}={shortened(text) or 'VALUE'}"
+            fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
+            raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
+        first, *others = split(text)
+        is_open = text.startswith("[") and not text.endswith("]")
+        use = shortened(f"{text.rstrip(',')}]" if is_open else first)
+        rule = "must be one value; a list stands in brackets, without spaces"
+        require(not (others or is_open), name, rule, got=text, use=use)
+        texts[CHOICES.get(name, name)] = text
+    return texts
+
+
+def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
+    """The tree of words; before it the one of the file that `preset=FILE.yaml` names.
+
+    Args:
+      overrides: as typed after a command.
+      groups: groups of plugins whose choices are fields of the command.
+
+    Raises:
+      ConfigError: as `texts_of`, and for a file that cannot be read.
+
+    Example:
+      >>> trees_of(["agent=ddqn", "es.noise_std=0.1"], ["es"])
+      [{'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}]
+    """
+    texts: Tree = {name: unquoted(text) for name, text in texts_of(overrides).items()}
+    if not texts.get("preset", "").endswith((".yaml", ".yml")):
+        return [_tree(texts, groups)]
+    path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
+    try:
+        values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
+        file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
+        for group in groups:  # fields of a choice that a typed one replaces
+            name = typed.get(group, {}).get("name")
+            if name is not None and file.get(group, {}).get("name", name) != name:
+                del file[group]
+        is_whole = bool(CHOOSE_ALL & texts.keys())
+        return [without_replaced(file, typed, is_whole), typed]
+    except ConfigError:  # it is readable
+        raise
+    except UNREADABLE as error:
+        must = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
+        raise ConfigError("preset", must, use="best") from error
+
+
+def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
+    """Values by their names in words as a tree; see above for agents."""
+    tree: Tree = {"agents": chosen(values)}
+    for name in [name for name in values if name not in CHOOSE_ALL]:
+        value, is_choice = values[name], name in groups or BY_KEY.fullmatch(name)
+        for part in reversed([*name.split("."), *(["name"] if is_choice else [])]):
+            value = {part: value}
+        tree = merge(tree, value)
+    return old.of_today(tree)
+
+
+def expand(overrides: Sequence[str]) -> list[list[str]]:
+    """The words of each run of a sweep: commas outside of brackets separate values.
+
+    Example:
+      >>> expand(["env=acrobot", "seed=0,1"])
+      [['env=acrobot', 'seed=0'], ['env=acrobot', 'seed=1']]
+    """
+    pairs = (override.partition("=") for override in overrides)
+    values = [[f"{name}{equals}{value}" for value in split(text)] for name, equals, text in pairs]
+    return [list(of_run) for of_run in itertools.product(*values)]
+
+
+# --- agents ---------------------------------------------------------------------------------------
+
+
+def chosen(values: Mapping[str, Any]) -> Tree:
+    """The agents that `agent=ddqn` or `agents=[ddqn,ppo]` choose, by key.
+
+    Raises:
+      ConfigError: if both words are there, or one names an agent twice or none.
+    """
+    known: list[str] = []
+    for word in [word for word in values if word in CHOOSE_ALL]:
+        text = str(values[word])
+        is_list = text.startswith("[") and text.endswith("]")
+        names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
+        several = ",".join(dict.fromkeys(filter(None, [*known, *names]))) or "ddqn,ppo"
+        is_clear = all(names) and not known and len({*names}) == len(names)
+        fix = f"Set agents=[{shortened(several)}]."
+        require(is_clear, word, "must name each agent once", got=values[word], fix=fix)
+        known = names
+    return {registry.key_of(name): {"name": name} for name in known}
+
+
+def names_of(agents: Mapping[str, Any]) -> dict[str, str]:
+    """The names of the chosen agents by their keys."""
+    named = {key: x for key, x in agents.items() if isinstance(x, Mapping) and "name" in x}
+    return {key: str(x["name"]) for key, x in named.items()}
+
+
+def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
+    """The tree of a file without the agents, and their weights, that typed choices replace.
+
+    Args:
+      file: the file's tree.
+      typed: the words' tree.
+      is_whole: whether words choose all agents; `agents.KEY=ppo` chooses one.
+    """
+    named = file["agents"]
+    if len(named) == 1:
+        file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
+    if names := names_of(typed["agents"]):
+        keys = names.keys() if is_whole else named.keys() | names.keys()
+        others = {k for k, x in names_of(named).items() if names.get(k, x) != x}
+        file["agents"] = {key: x for key, x in named.items() if key in keys - others}
+        mixture = dict(file.pop("mixture", {}))
+        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in keys}
+        if len(keys) > 1:
+            file |= {"mixture": mixture | {"weights": weights}} if mixture or weights else {}
+            file.pop("agent", None)
+    return file
+
+
+def settled(tree: Tree, names: Mapping[str, str]) -> Tree:
+    """The tree with the fields of `agent` under the only agent's key.
+
+    Args:
+      tree: of words, or of a file.
+      names: names of the chosen agents by key.
+
+    Raises:
+      ConfigError: if there are such fields, and several agents.
+    """
+    fields, key = tree.get("agent", {}), next(iter(names))
+    for field, value in flatten(fields).items() if len(names) > 1 else ():
+        classes = {key: registry.find("agent", name) for key, name in names.items()}
+        having = [key for key, x in classes.items() if field.split(".")[0] in defaults_of(x)]
+        fix = f"Set agents.{(having or [key])[0]}.{field:.40}={shortened(value, 40)}."
+        raise ConfigError(f"agent.{field:.40}", "must be one agent's", got=value, fix=fix)
+    others = {name: x for name, x in tree.items() if name != "agent"}
+    return others | {"agents": merge(tree["agents"], {key: fields})}
+
+
+def as_typed(name: str, keys: Collection[str]) -> str:
+    """A field's name as a user types it, with agents of these keys.
+
+    Example:
+      >>> as_typed("agents.ddqn.tau", ["ddqn"]), as_typed("agents.ddqn.tau", ["ddqn", "ppo"])
+      ('agent.tau', 'agents.ddqn.tau')
+    """
+    prefix = f"agents.{next(iter(keys), '')}"
+    is_only = len(keys) == 1 and f"{name}.".startswith(f"{prefix}.")
+    return "agent" + name.removeprefix(prefix) if is_only else name
