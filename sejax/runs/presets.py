@@ -1,8 +1,8 @@
 """Presets: the settings of a task and proxy that were measured or published.
 
-They are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has values, and more
-values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy or objective each.
-`like` names the section that it builds on, in its file or in `bases.yaml`.
+They are `presets/<env>-<proxy>.yaml`, with a section for each preset. A section has values, and
+more values under `with_agent`, `with_es` and `with_objective`, for one agent, strategy or objective
+each. `like` names the section that it builds on, in its file or in `bases.yaml`.
 `general-<proxy>.yaml` serves tasks without a file of their own, and sections with `like: general`.
 A user's file holds overrides.
 """
