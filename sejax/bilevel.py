@@ -139,12 +139,13 @@ class Bilevel:
         # XLA must not fuse the sums below into the program of the outcome: they would round
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
-        compared = self.scoring.for_strategy(outcome)
+        compared, mean_score = self.scoring.for_strategy(outcome)
         es_state = self.layout.strategy.tell(
-            candidates.key_tell, candidates.population, *compared, candidates.es_state
+            candidates.key_tell, candidates.population, compared, mean_score, candidates.es_state
         )
         scores = self.scoring.reported(outcome)
-        score, agent_means = or_minus_inf(scores.incumbent_mean), or_minus_inf(scores.agent_means)
+        score = or_minus_inf(scores.incumbent_mean)
+        agent_means = or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
         after = dataclasses.replace(
             state,

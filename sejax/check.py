@@ -195,13 +195,14 @@ def _others(config: CheckConfig, proxy: Proxy) -> dict[str, AgentConfig]:
     return others
 
 
-def _myopic(learned: dict[str, AgentConfig]) -> dict[str, dict[str, Any]]:
+def _myopic(learned: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The proxy's agents with lower discounts, by row of the table and by key."""
-    rows = dict[str, dict[str, Any]]()
-    for x in DISCOUNTS:
-        with_it = ((key, dataclasses.replace(a, **{"discount": x})) for key, a in learned.items())
-        rows[MYOPIC.format(x)] = {f"{key}-{x:g}": agent for key, agent in with_it}
-    return rows
+    return {
+        MYOPIC.format(x): {
+            f"{key}-{x:g}": dataclasses.replace(agent, discount=x) for key, agent in learned.items()
+        }
+        for x in DISCOUNTS
+    }
 
 
 def _tuned(task: Task) -> AgentConfig:

@@ -59,20 +59,28 @@ class Layout:
         """
         return self.mixture.deal(self.strategy.num_candidates, self.strategy.antithetic)
 
+    @property
+    def num_evaluations(self) -> int:
+        """Trainings on candidates; those on the incumbent come after them."""
+        return self.strategy.num_candidates * self.strategy.num_evals
+
+    @functools.cached_property
+    def evaluations_of(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the numbers of its trainings on candidates, ascending."""
+        by_candidate = np.arange(self.num_evaluations).reshape(-1, self.strategy.num_evals)
+        return tuple(by_candidate[candidates].ravel() for candidates in self.candidates_of)
+
     @functools.cached_property
     def trainings_of(self) -> tuple[np.ndarray, ...]:
-        """For each agent, the numbers of its trainings, ascending; see the table above."""
-        num_evals, trainings = self.strategy.num_evals, []
-        turns = self.strategy.num_candidates * num_evals + np.arange(self.num_incumbent_evals)
-        for agent_index, candidates in enumerate(self.candidates_of):
-            on_population = np.add.outer(candidates * num_evals, np.arange(num_evals)).ravel()
-            on_incumbent = turns[agent_index :: self.mixture.size]
-            trainings.append(np.concatenate([on_population, on_incumbent]))
-        return tuple(trainings)
+        """For each agent, the numbers of all its trainings, ascending; see the table above."""
+        on_incumbent = self.num_evaluations + np.arange(self.num_incumbent_evals)
+        turns = on_incumbent.reshape(-1, self.mixture.size).T  # [agent, turn]
+        pairs = zip(self.evaluations_of, turns, strict=True)
+        return tuple(np.concatenate(pair) for pair in pairs)
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""
-        of_population = np.arange(self.strategy.num_candidates * self.strategy.num_evals)
+        of_population = np.arange(self.num_evaluations)
         of_incumbent = np.arange(self.num_incumbent_evals)
         if self.strategy.common_random_numbers:
             of_population = of_population % self.strategy.num_evals
@@ -153,11 +161,11 @@ class GenerationEvaluator:
             task, test_env = proxy.task, objective.test_env
             evaluate = make_evaluator(agent, proxy, task, training, test_env, in_batches=False)
 
-            def run(one: Trainings) -> Outcome:
+            def evaluate_one(one: Trainings) -> Outcome:
                 params = proxy.params(unravel(one.weights))
                 return evaluate(one.key, params, one.active, one.test_params)
 
-            return run
+            return evaluate_one
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
@@ -172,17 +180,18 @@ class GenerationEvaluator:
 
     def trainings(self, candidates: Candidates) -> list[Trainings]:
         """The trainings of each agent: on its candidates, and then on the incumbent."""
-        shared, by_agent = (candidates.active, candidates.test_params), []
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
-        num_evals = self._layout.strategy.num_evals
-        for numbers in self._layout.trainings_of:
-            rows = np.minimum(numbers // num_evals, len(weights) - 1)  # the incumbent's is the last
+        shared = candidates.active, candidates.test_params
+
+        def of_agent(numbers: np.ndarray) -> Trainings:
+            # The incumbent's weights are the last.
+            rows = np.minimum(numbers // self._layout.strategy.num_evals, len(weights) - 1)
             active, test_params = jax.tree.map(
-                lambda x, size=numbers.size: jnp.broadcast_to(x, (size, *jnp.shape(x))), shared
+                lambda x: jnp.broadcast_to(x, (numbers.size, *jnp.shape(x))), shared
             )
-            keys = candidates.keys[numbers]
-            by_agent.append(Trainings(keys, weights[rows], active, test_params))
-        return by_agent
+            return Trainings(candidates.keys[numbers], weights[rows], active, test_params)
+
+        return [of_agent(numbers) for numbers in self._layout.trainings_of]
 
     def joined(self, by_agent: Sequence[Outcome]) -> Outcome:
         """The outcomes of all `trainings`: by candidate, and then by turn of the incumbent.

@@ -70,8 +70,9 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
         program = str(config.plain() | {"seed": 0, "run_dir": None})
         by_program.setdefault(program, []).append(config)
     # The last run of a sweep must not be refused after the others have run.
-    for config, *_ in by_program.values() if len(by_program) > 1 else ():
-        make_bilevel(**config.parts())
+    if len(by_program) > 1:
+        for config, *_ in by_program.values():
+            make_bilevel(**config.parts())
     scores = dict[Path, float]()
     diverged = list[Path]()
     for of_program in by_program.values():

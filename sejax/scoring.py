@@ -128,19 +128,15 @@ class Scoring:
         )
 
     def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        means, num_in_population = [], scores.size - self.layout.num_incumbent_evals
-        population, incumbent = jnp.split(scores, [num_in_population])
-        for numbers in self.layout.trainings_of:
-            on_incumbent = numbers[numbers >= num_in_population] - num_in_population
-            of_agent = incumbent[on_incumbent], population[numbers[numbers < num_in_population]]
-            repaired, mean = with_diverged_last(*of_agent)
-            incumbent = incumbent.at[on_incumbent].set(repaired)
-            means.append(mean)
-        agent_means = jnp.stack(means)
+        population, incumbent = jnp.split(scores, [self.layout.num_evaluations])
+        turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
+        by_agent = zip(turns, self.layout.evaluations_of, strict=True)
+        pairs = [with_diverged_last(mine, population[numbers]) for mine, numbers in by_agent]
+        repaired, agent_means = map(jnp.stack, zip(*pairs, strict=True))
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
-            incumbent=incumbent,
+            incumbent=repaired.T.ravel(),
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
             diverged=jnp.isnan(scores),

@@ -357,7 +357,7 @@ class _Loop:
         large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
         (stored, _), (key, _) = large, consts
         is_full = state.step == first_step + buffer.learns_every
-        keys = _StepKeys(*step_keys(key, state.step - 1, 6))
+        keys = _StepKeys(*step_keys(key, state.step - 1, 6))  # the last step, without learning
         agent_state = self.learn(buffer, stored, None, state.step, keys, state, is_full)
         return large, dataclasses.replace(state, agent_state=agent_state)
 
@@ -411,26 +411,25 @@ class _Loop:
         if learns:
             agent_state = self.learn(buffer, stored, transition, state.step + 1, keys, state)
         train_steps = state.train_steps + info.get("sejax_num_steps", 1)
+        # A row of the curve; one that is out of range is dropped.
+        row = jnp.where(finished, state.episode, self.training.max_episodes)
+        rows = {"returns": state.episode_return + reward, "episode_ends": train_steps}
         state = dataclasses.replace(
             state,
             step=state.step + 1,
             train_steps=train_steps,
-            episode_return=state.episode_return + reward,
+            episode_return=rows["returns"],
             obs=next_obs,
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=nonfinite,
             active=state.active & (train_steps < (self.training.max_steps or LARGEST)),
         )
-        before = state
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
         )
-        rows = {"returns": before.episode_return, "episode_ends": train_steps}
         rows["test_returns"] = state.tested
-        # Written in place; a row that is out of range is dropped.
-        number = jnp.where(finished, before.episode, self.training.max_episodes)
-        curve = {name: x.at[number].set(rows[name], mode="drop") for name, x in curve.items()}
+        curve = {name: x.at[row].set(rows[name], mode="drop") for name, x in curve.items()}
         return (stored, curve), state
 
     def end_episode(

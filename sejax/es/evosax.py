@@ -128,8 +128,7 @@ def from_evosax(
     ) -> StrategyState:
         # An infinity would poison algorithms that standardise. So a score that is not finite
         # becomes worse than the worst.
-        finite = jnp.isfinite(scores)
-        fitness = -jnp.where(finite, scores, finite.any() * below_all(scores))
+        fitness = -jnp.where(jnp.isfinite(scores), scores, below_all(scores))
         told = algorithm.tell(key, population, fitness, state, params)[0]
         # Some algorithms move, or shrink their std, where no candidate is better than another.
         is_told = fitness.max() > fitness.min()

@@ -169,7 +169,8 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    is_no = "is no field" + " any more" * any(x.endswith(f".{last}") for x in old.GONE)
+    was_one = any(x.endswith(f".{last}") for x in old.GONE)
+    is_no = "is no field any more" if was_one else "is no field"
     return ConfigError(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
 
 

@@ -306,7 +306,7 @@ def imported(field: str, path: str) -> Any:
     except Exception as error:
         is_lost = isinstance(error, ModuleNotFoundError) and not place_of(error)
         must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}."
-        must += " Is its folder in PYTHONPATH?" * is_lost
+        must += " Is its folder in PYTHONPATH?" if is_lost else ""
         raise ConfigError(field, must) from error
 
 

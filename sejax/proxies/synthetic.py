@@ -264,20 +264,16 @@ class SyntheticEnv(ProxyEnv):
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
         is_sane = size < MAX_ABS_VALUE  # False for nan
         state = SyntheticState(vector=jnp.where(is_sane, vector, state.vector), time=state.time + 1)
-        ends, discount = self.ends(key, done), 1.0 - done
-        if self.config.min_steps > 1:
-            may_end = state.time >= self.config.min_steps
-            ends, discount = ends & may_end, jnp.where(may_end, discount, 1.0)
-        ends |= ~is_sane
-        at_horizon = self.config.horizon is not None and state.time >= params.max_steps_in_episode
-        terminated = ends | at_horizon
-        if self.config.done != "soft":
-            discount = 1.0 - ends
+        may_end = state.time >= self.config.min_steps
+        ends = (self.ends(key, done) & may_end) | ~is_sane
+        at_horizon = (self.config.horizon is not None) & (state.time >= params.max_steps_in_episode)
+        soft = jnp.where(may_end, 1.0 - done, 1.0)
+        discount = soft if self.config.done == "soft" else 1.0 - ends
         info = {
-            "discount": jnp.where(is_sane & jnp.logical_not(at_horizon), discount, 0.0),
+            "discount": jnp.where(is_sane & ~at_horizon, discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),
         }
-        return self.observe(state), state, jnp.where(is_sane, reward, 0.0), terminated, info
+        return self.observe(state), state, jnp.where(is_sane, reward, 0.0), ends | at_horizon, info
 
     def ends(self, key: Array, done: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the done output ends the episode."""

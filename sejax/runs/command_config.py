@@ -166,8 +166,10 @@ class CommandConfig(Options, ABC):
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "")
-        unknown = {k: x for k, x in tree.items() if k not in known and old.GONE.get(k, tree) != x}
-        for name in flatten(unknown) or unknown:
+        gone = old.GONE.items()  # by equality: values may have no hash
+        unknown = {k: x for k, x in tree.items() if k not in known and (k, x) not in gone}
+        if unknown:
+            name = next(iter(flatten(unknown) or unknown))
             is_elsewhere = name.partition(".")[0] in registry.GROUPS
             require(not is_elsewhere, shortened(name, 40), "is no field here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))

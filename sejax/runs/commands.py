@@ -45,7 +45,8 @@ def start(
     words = sys.argv[1:]
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _stop)
-    with messages(" What has ended is saved; the same command goes on from there." * resumes):
+    goes_on = " What has ended is saved; the same command goes on from there."
+    with messages(goes_on if resumes else ""):
         is_known = configs_of or PRINT_CONFIG not in words
         require(is_known, PRINT_CONFIG, "is of sejax.run and sejax.evaluate alone. Leave it out.")
         overrides = [word for word in words if word not in (*HELP, PRINT_CONFIG)]

@@ -99,9 +99,9 @@ class LearnConfig(CommandConfig):
         is_alone, given = len(self.agents) == 1, self.mixture.weights
         is_idle = is_alone and self.mixture != MixtureConfig()
         require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
-        for key in given.keys() - self.agents.keys():
+        if unknown := given.keys() - self.agents.keys():
             known = [f"mixture.weights.{x}" for x in self.agents]
-            raise unknown_field(f"mixture.weights.{shortened(key)}", known)
+            raise unknown_field(f"mixture.weights.{shortened(min(unknown))}", known)
         weights = {} if is_alone else {key: given.get(key, 1.0) for key in self.agents}
         are_some = is_alone or any(weights.values())
         require(are_some, "mixture.weights", "must have one above 0. Leave one of them out.")

@@ -69,10 +69,12 @@ class RunProgress:
         env, explored = self._config.name("env"), self._config.name("exploration")
         named = {"env": env, "proxy_kind": proxy, "exploration": explored}
         typed = [f"{name}={text}" for name, text in named.items() if ":" in text]
-        typed += [f"agents.{key}={name}" for key, name in agents.items() if is_own]
-        typed += ["agent_hparams=as_learned"] * is_own
+        if is_own:
+            typed += [f"agents.{key}={name}" for key, name in agents.items()]
+            typed.append("agent_hparams=as_learned")
         words = "".join(f" {shlex.quote(word)}" for word in typed)
-        arguments = ", task=YOUR_TASK" * (":" in env) + ", proxy=YOUR_CONFIG" * (":" in proxy)
+        arguments = ", task=YOUR_TASK" if ":" in env else ""
+        arguments += ", proxy=YOUR_CONFIG" if ":" in proxy else ""
         self.say(
             f"\n{bilevel.proxy.task.name}: {'solved' if is_solved else 'finished'}\n"
             f"{verdict}\n\n"

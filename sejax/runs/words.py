@@ -188,7 +188,8 @@ def settled(tree: Tree, names: Mapping[str, str]) -> Tree:
       ConfigError: if there are such fields, and several agents.
     """
     fields, key = tree.get("agent", {}), next(iter(names))
-    for field, value in flatten(fields).items() if len(names) > 1 else ():
+    if fields and len(names) > 1:
+        field, value = next(iter(flatten(fields).items()))
         classes = {key: registry.find("agent", name) for key, name in names.items()}
         having = [key for key, x in classes.items() if field.split(".")[0] in defaults_of(x)]
         fix = f"Set agents.{(having or [key])[0]}.{field:.40}={shortened(value, 40)}."

@@ -149,8 +149,8 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
             if name not in typed:
                 space.setdefault(name, dimension)
     fields = default.named(default.plain())
-    for name in space.keys() - fields.keys():
-        raise unknown_field(name, fields)
+    if unknown := space.keys() - fields.keys():
+        raise unknown_field(min(unknown), fields)
     for name, x in space.items():
         is_fit = type(fields[name]) is not int or not isinstance(x.distribution, FloatDistribution)
         use = f"'{x.text.replace('interval(', 'int(interval(').replace(')', '))', 1)}'"

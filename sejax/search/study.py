@@ -290,7 +290,7 @@ def _tried_again(study: optuna.Study, plan: StudyPlan, number: int) -> dict[str,
 def write_best(overrides: Sequence[str], plan: StudyPlan) -> str:
     """Writes settings as a command and as a preset; returns the command."""
     # A preset file of a run names its folder, which holds that run.
-    words = [*plan.fixed, *overrides, *["run_dir=null"] * bool(plan.default.run_dir)]
+    words = [*plan.fixed, *overrides, *(["run_dir=null"] if plan.default.run_dir else [])]
     line = shlex.join(["python", "-m", "sejax.run", *words])
     read = plan.default.named(LearnConfig.layers_of(words)["typed"])
     settings = {name: parsed(x) if isinstance(x, str) else x for name, x in read.items()}
