@@ -69,9 +69,8 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a proxy that cannot be loaded.
       OSError: if a file cannot be written.
     """
-    configs = configs_of(overrides)
     runtime.configure_jax()
-    for config in configs:
+    for config in configs_of(overrides):
         evaluate(config)
 
 
@@ -81,9 +80,8 @@ help_text = functools.partial(commands.help_of, EvaluateConfig, __doc__)
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     configs = EvaluateConfig.of_sweep(overrides)
-    if len(configs) == 1:
-        return configs
-    configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
+    if len(configs) > 1:
+        configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
     return apart(configs)
 
 

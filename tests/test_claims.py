@@ -100,6 +100,7 @@ def test_numbers_and_tables_are_written(project, tmp_path):
     assert (tmp_path / "README.md").read_text() == DOCUMENT
 
 
+@pytest.mark.slow
 def test_a_changed_row_of_an_experiment_is_found(tmp_path):
     name = "results/agents"
     shutil.copytree(claims.ROOT / name, tmp_path / name)  # whose table is that of its rows

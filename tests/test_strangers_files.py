@@ -5,6 +5,7 @@ imported, or a function of Python's own that runs a shell command.
 """
 
 import functools
+import importlib
 import sys
 from dataclasses import make_dataclass
 from pathlib import Path
@@ -65,9 +66,9 @@ def refused(monkeypatch, capsys):
     return refuse
 
 
-run_command, evaluate_command, search_command, distill_command = (
+run_command, evaluate_command, search_command, distill_command, check_command = (
     functools.partial(commands.start, module.main, module.help_text)
-    for module in (run, evaluate, search, distill)
+    for module in (run, evaluate, search, distill, importlib.import_module("sejax.check"))
 )
 
 
@@ -120,7 +121,7 @@ PRESETS = [
     {"es.score_transform": IMPORTED}, {"tracker": IMPORTED}, {"policy": IMPORTED},
     {"es.score_transform": f"'{IMPORTED}'"}, {"agents": f"[ddqn, '{IMPORTED}']"},
     {"es.score_transform": IMPORTED.encode()}, {"policy": IMPORTED.encode()},  # !!binary
-    {"es.score_transform": "strangers_module:é".encode()},
+    {"es.score_transform": "strangers_module:é".encode()}, {"algorithms": [IMPORTED]},
 ]  # fmt: skip
 
 
@@ -130,6 +131,7 @@ def test_a_preset_file_names_no_module(folder, refused, preset):
     refused(run_command, "preset=p.yaml")
     refused(distill_command, "preset=p.yaml")
     refused(evaluate_command, "preset=p.yaml", "proxy=cartpole")
+    refused(check_command, "preset=p.yaml", "proxy=cartpole")
     refused(search_command, "preset=p.yaml", SPACE)
 
 

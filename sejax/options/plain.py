@@ -34,8 +34,8 @@ MISSING = dataclasses.MISSING
 NAMED = 2  # fields of a message about settings that differ
 # Our names of fields, by the names that others use.
 SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
-# Last parts of the names of fields whose text may be a `module:attribute`.
-NAMES_CODE = ("name", "env", "policy", "proxy_kind", "score_transform")
+# Last parts of the names of fields whose text may be a `module:attribute`, or code's address.
+NAMES_CODE = ("name", "env", "policy", "proxy_kind", "score_transform", "algorithms", "address")
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
 
 
@@ -135,23 +135,26 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         return cls(**fields)
 
 
-def require_typed(values: Mapping[str, Any], typed: Collection[str] = (), where: str = "") -> None:
+def require_typed(values: Mapping[str, Any], typed: Collection[str] = ()) -> None:
     """Checks that plain values of a file name no code but what the user has typed.
 
     Args:
-      values: nested plain values.
-      typed: each `module:attribute` that may be imported.
-      where: the values' name in messages, as `agent`.
+      values: nested plain values, by the names of fields or groups.
+      typed: each `module:attribute` that may be imported; see `code_in`.
 
     Raises:
       ConfigError: for the first field of `NAMES_CODE` that names another one.
     """
-    for name, value in flatten(values, f"{where}." if where else "").items():
-        text = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-        if name.rpartition(".")[2] in NAMES_CODE and ":" in text and text not in typed:
+    must = "must be typed, as names in files are never imported"
+    for name, text in code_in(values).items():
+        if ":" in text and text not in typed:
             use = f"{shortened(text, 60)}, if you trust it"
-            must = "must be typed, as names in files are never imported"
             raise ConfigError(name.removesuffix(".name"), must, got=text, use=use)
+
+
+def code_in(values: Mapping[str, Any]) -> dict[str, str]:
+    """The texts of fields of `NAMES_CODE` in nested plain values."""
+    return {k: str(x) for k, x in flatten(values).items() if k.rpartition(".")[2] in NAMES_CODE}
 
 
 def defaults_of(cls: type) -> dict[str, Any]:
@@ -169,9 +172,9 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    was_one = any(x.endswith(f".{last}") for x in old.GONE)
-    is_no = "is no field any more" if was_one else "is no field"
-    return ConfigError(field, is_no, fix=f"{fix}Fields: {listed(ranked)}.")
+    is_gone = any(x.endswith(f".{last}") for x in old.GONE)
+    rule = "is no field any more" if is_gone else "is no field"
+    return ConfigError(field, rule, fix=f"{fix}Fields: {listed(ranked)}.")
 
 
 class _Field(typing.NamedTuple):

@@ -129,7 +129,7 @@ def configured(group: str, values: object, where: str) -> Any:
       ConfigError: if there are no values, or their name is not registered.
     """
     if is_registered(group, values):
-        require_typed(values, where=group)  # type: ignore[arg-type]
+        require_typed({group: values})
         return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"
     field, word = PLUGIN_ARGUMENTS.get(group, group), PLUGIN_WORDS.get(group, group)

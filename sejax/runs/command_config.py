@@ -31,6 +31,7 @@ from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, errors_of, old, registry, require, shortened
 from sejax.options.plain import (
+    code_in,
     flatten,
     from_plain,
     merge,
@@ -44,6 +45,8 @@ from sejax.proxies import ProxyConfig
 from sejax.runs.words import Tree, as_typed, expand, names_of, settled, trees_of
 from sejax.training import TrainingConfig, require_reachable
 
+# Fields of `sejax.run` that no other command has.
+OF_RUNS = ("mixture", "generations", "num_seeds", "stop_when_solved", "checkpoint_every")
 PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
 
 
@@ -145,14 +148,13 @@ class CommandConfig(Options, ABC):
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
         trees = trees_of(overrides, cls.groups())
-        typed, texts = merge(*trees), {*map(str, flatten(trees[-1]).values())}
-        require_typed(typed, texts)  # a file may have named code
+        typed, code = merge(*trees), code_in(trees[-1]).values()
+        require_typed(typed, code)
         layers = cls.layers_below(typed)
         below = merge(*layers.values())
-        require_typed(below, texts)
+        require_typed(below, code)
         names = names_of(below["agents"])
-        typed = merge(*(settled(tree, names) for tree in trees))
-        return layers | {"typed": typed}
+        return layers | {"typed": merge(*(settled(tree, names) for tree in trees))}
 
     @classmethod
     def of_tree(cls, tree: Tree) -> Self:
@@ -170,7 +172,7 @@ class CommandConfig(Options, ABC):
         unknown = {k: x for k, x in tree.items() if k not in known and (k, x) not in gone}
         if unknown:
             name = next(iter(flatten(unknown) or unknown))
-            is_elsewhere = name.partition(".")[0] in registry.GROUPS
+            is_elsewhere = name.partition(".")[0] in {*registry.GROUPS, *OF_RUNS}
             require(not is_elsewhere, shortened(name, 40), "is no field here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config

@@ -14,7 +14,7 @@ from sejax import agents, envs
 from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
 from sejax.options import ConfigError, Count, registry, require
-from sejax.options.plain import configure, flatten, merge, to_plain
+from sejax.options.plain import configure, flatten, merge, require_typed, to_plain
 from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs.command_config import CommandConfig
@@ -95,8 +95,7 @@ class FreshAgentsConfig(CommandConfig):
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
-        if stored:
-            learned = learned_layer(stored.config)
+                learned = learned_layer(stored.config)
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
             are_same = names in ({}, names_of(learned["agents"]))
@@ -175,6 +174,7 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     """
     path, _, learned = header.read(config.proxy, "proxy")
     stored = learned.config
+    require_typed({group: {**stored[group], "name": ""} for group in ("env", "proxy")})
     task = proxy_config = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}

@@ -69,9 +69,8 @@ class RunProgress:
         env, explored = self._config.name("env"), self._config.name("exploration")
         named = {"env": env, "proxy_kind": proxy, "exploration": explored}
         typed = [f"{name}={text}" for name, text in named.items() if ":" in text]
-        if is_own:
-            typed += [f"agents.{key}={name}" for key, name in agents.items()]
-            typed.append("agent_hparams=as_learned")
+        own = [f"agents.{key}={name}" for key, name in agents.items()]
+        typed += [*own, "agent_hparams=as_learned"] if is_own else []
         words = "".join(f" {shlex.quote(word)}" for word in typed)
         arguments = ", task=YOUR_TASK" if ":" in env else ""
         arguments += ", proxy=YOUR_CONFIG" if ":" in proxy else ""

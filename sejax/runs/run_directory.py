@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from sejax.ops.files import remove_leftovers, write_text
 from sejax.options import ConfigError
-from sejax.options.plain import flatten
+from sejax.options.plain import code_in
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
@@ -92,9 +92,8 @@ class RunDirectory(Store):
 
         These defaults change no number.
         """
-        typed = {*map(str, flatten(self.settings).values())}
         try:
-            return LearnConfig.of_stored(stored, typed).plain()
+            return LearnConfig.of_stored(stored, code_in(self.settings).values()).plain()
         except ConfigError:
             return stored
 

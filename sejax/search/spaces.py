@@ -57,6 +57,8 @@ class Dimension:
     def value(self, params: Mapping[str, Any]) -> str:
         """The field's value in stored parameters, as an override writes it."""
         value = params[self.parameter]
+        known = getattr(self.distribution, "choices", (value,))
+        require(value in known, self.name, "must be in its range", got=value)
         if isinstance(value, float):
             value = f"{1 - value if self.is_inverse else value:.{DIGITS}g}"
         return str(value)
@@ -153,5 +155,5 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
         raise ConfigError("space", f"{must}; got {got}", use="paper_se") from error
     foreign = [text for text in texts.values() if ":" in str(text)]
     fix = "Type this range on the command line."
-    require(not foreign, "space", "must name no module", got=", ".join(foreign), fix=fix)
+    require(not foreign, "space", "must name no module", got=", ".join(map(str, foreign)), fix=fix)
     return {str(field): parse(str(field), str(text)) for field, text in texts.items()}
