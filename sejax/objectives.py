@@ -77,11 +77,19 @@ class Objective:
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """The scores that compare candidates; nan for diverged agents."""
+        """The scores that compare candidates; nan for diverged agents.
+
+        Raises:
+          ConfigError: unless there is a score for each agent.
+        """
         return _checked(self.score(outcome), outcome.nonfinite)
 
     def reported(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """The scores that people see; nan for diverged agents."""
+        """The scores that people see; nan for diverged agents.
+
+        Raises:
+          ConfigError: unless there is a score for each agent.
+        """
         return _checked((self.shown or self.score)(outcome), outcome.nonfinite)
 
 

@@ -127,11 +127,11 @@ class Scoring:
             active=active,
         )
 
-    def _scores(self, scores: Float[Array, " training"]) -> Scores:
-        population, incumbent = jnp.split(scores, [self.layout.num_evaluations])
+    def _scores(self, of_trainings: Float[Array, " training"]) -> Scores:
+        population, incumbent = jnp.split(of_trainings, [self.layout.num_evaluations])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
         by_agent = zip(turns, self.layout.evaluations_of, strict=True)
-        pairs = [with_diverged_last(mine, population[numbers]) for mine, numbers in by_agent]
+        pairs = [with_diverged_last(scores, population[numbers]) for scores, numbers in by_agent]
         repaired, agent_means = map(jnp.stack, zip(*pairs, strict=True))
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
@@ -139,7 +139,7 @@ class Scoring:
             incumbent=repaired.T.ravel(),
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
-            diverged=jnp.isnan(scores),
+            diverged=jnp.isnan(of_trainings),
         )
 
     def _by_agent(

@@ -357,7 +357,8 @@ class _Loop:
         large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
         (stored, _), (key, _) = large, consts
         is_full = state.step == first_step + buffer.learns_every
-        keys = _StepKeys(*step_keys(key, state.step - 1, 6))  # the last step, without learning
+        # Keys of the last step, which did not learn.
+        keys = _StepKeys(*step_keys(key, state.step - 1, 6))
         agent_state = self.learn(buffer, stored, None, state.step, keys, state, is_full)
         return large, dataclasses.replace(state, agent_state=agent_state)
 
@@ -411,14 +412,14 @@ class _Loop:
         if learns:
             agent_state = self.learn(buffer, stored, transition, state.step + 1, keys, state)
         train_steps = state.train_steps + info.get("sejax_num_steps", 1)
-        # A row of the curve; one that is out of range is dropped.
+        # The episode's row of the curve; one that is out of range is dropped.
         row = jnp.where(finished, state.episode, self.training.max_episodes)
-        rows = {"returns": state.episode_return + reward, "episode_ends": train_steps}
+        entries = {"returns": state.episode_return + reward, "episode_ends": train_steps}
         state = dataclasses.replace(
             state,
             step=state.step + 1,
             train_steps=train_steps,
-            episode_return=rows["returns"],
+            episode_return=entries["returns"],
             obs=next_obs,
             env_state=env_state,
             agent_state=agent_state,
@@ -428,8 +429,8 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
         )
-        rows["test_returns"] = state.tested
-        curve = {name: x.at[row].set(rows[name], mode="drop") for name, x in curve.items()}
+        entries["test_returns"] = state.tested
+        curve = {name: x.at[row].set(entries[name], mode="drop") for name, x in curve.items()}
         return (stored, curve), state
 
     def end_episode(

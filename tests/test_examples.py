@@ -78,8 +78,8 @@ def test_every_example_is_tested():
 def _marked(name):
     """An example with its marks: warnings of another package are its own."""
     own = [pytest.mark.filterwarnings("default")] if name in NEEDS else []
-    is_slow = name not in NEEDS  # it compiles for seconds
-    return pytest.param(name, marks=[*own, *([pytest.mark.slow] if is_slow else [])])
+    # Those without another package compile for seconds.
+    return pytest.param(name, marks=[*own, *([] if name in NEEDS else [pytest.mark.slow])])
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in TINY])

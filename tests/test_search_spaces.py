@@ -32,6 +32,7 @@ def test_inverse_ranges_are_drawn_in_the_distance_from_1():
     dimension = spaces.parse("agent.discount", "tag(log, inverse, interval(0.9, 0.999))")
     assert dimension.value({"1 - agent.discount": 0.0123456789}) == "0.987654"
     assert dimension.value({"1 - agent.discount": 0.1}) == "0.9"
+    assert refused(spaces.parse("a.b", "choice(x,y)").value, {"a.b": "theirs:z"}) == "a.b"
     assert dimension.parameter_of(0.99) == pytest.approx(0.01)
     assert dimension.parameter_of(0.5) is None
 

@@ -143,10 +143,12 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     assert (folder / "typed").exists()
 
 
-def test_other_texts_with_a_colon_are_taken(folder):
+def test_other_texts_with_a_colon_are_taken_but_no_address_of_a_cluster(folder):
     (folder / "p.yaml").write_text("run_dir: runs/env:cartpole\n")
     assert sejax.config(["preset=p.yaml"]).run_dir == "runs/env:cartpole"
     assert distill.DistillConfig.of_words([r"policy=ppo:models\best.zip"]).policy
+    (folder / "p.yaml").write_text("machines: ray\nmachines.address: theirs:6379\n")
+    assert refusal(sejax.config, ["preset=p.yaml"]).field == "machines.address"
 
 
 STUDIES = [

@@ -247,7 +247,8 @@ def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bo
     agent = counting(Tabular(QLearningConfig(warmup_episodes=2), 48, 4).agent(), 1.0, 48, 4)
     result, test_returns = trained(agent, task, num_episodes=200, num_agents=4)
     np.testing.assert_array_equal(test_returns, -12.0)
-    np.testing.assert_array_equal(returns := np.asarray(result.returns), np.round(returns))
+    returns = np.asarray(result.returns)
+    np.testing.assert_array_equal(returns, np.round(returns))
     # The first two episodes are not learned from. One that falls off takes -99 - return steps, one
     # that arrives 1 - return, and one that runs out of time 50.
     first = returns[:, :2]

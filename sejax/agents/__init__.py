@@ -115,7 +115,7 @@ def require_fit(
 
 
 def default_for(spec: TaskSpec) -> str:
-    """The default agent of a task: of networks or, if its states have numbers, a table."""
+    """The default agent of a task: DDQN or TD3; Q-learning where the states are indices."""
     usual = USUAL[spec.actions][0]
     return usual if _fits(registry.find("agent", usual), spec) else "q_learning"
 
