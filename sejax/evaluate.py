@@ -50,8 +50,9 @@ class EvaluateConfig(FreshAgentsConfig):
     @property
     def default_folder(self) -> str:
         """The folder of sweeps, of a shipped proxy or one of the Hub, and on the real task."""
-        is_real, proxy = self.proxy == "real", self.proxy.removeprefix(hub.SCHEME)
-        return f"runs/evaluate-{as_file_name(f'real-{self.env}' if is_real else proxy)}"
+        is_real = self.proxy == "real"
+        name = f"real-{self.env}" if is_real else self.proxy.removeprefix(hub.SCHEME)
+        return f"runs/evaluate-{as_file_name(name)}"
 
     @property
     def folder(self) -> Path:
@@ -95,14 +96,16 @@ def evaluate(config: EvaluateConfig) -> float:
       ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
         cannot be written.
     """
-    worlds, out_dir = fresh_agents.worlds_of(config), config.folder
+    worlds = fresh_agents.worlds_of(config)
+    out_dir = config.folder
     if not config.baseline:
         worlds = dict([*worlds.items()][:1])
     require_writable("out_dir", out_dir)  # before agents train for nothing
     pairs = itertools.product(worlds, config.agents)
     table = pd.concat([_train_and_test(config, x, worlds[x], key) for x, key in pairs])
     summary = fresh_agents.summarise(table, ["world", "agent"])
-    (key, *others), (name, world) = config.agents, next(iter(worlds.items()))
+    key, *others = config.agents
+    name, world = next(iter(worlds.items()))
     who = "agents of each algorithm" if others else f"{key} agents"
     solved = f" (solved at {world.task.solved_reward:g})" if world.task.is_solvable else ""
     title = f"{config.num_agents} fresh {who}, tested on {world.task.name}{solved}"

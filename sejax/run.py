@@ -44,8 +44,9 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     runs: list[LearnConfig] = []
     for config in LearnConfig.of_sweep(overrides):
         for seed in range(config.seed, config.seed + config.num_seeds):
-            is_alone, folder = config.num_seeds == 1, config.run_dir
-            folder = folder if is_alone else folder and f"{folder}/seed{seed}"
+            folder = config.run_dir
+            if folder and config.num_seeds > 1:
+                folder = f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
     return apart(runs)
 

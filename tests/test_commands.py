@@ -125,4 +125,4 @@ def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):
 
 def test_there_are_as_many_devices_as_any_run_of_a_sweep_needs():
     lines = "devices=1,2", "devices=x", "machines=ray", "machines=ray,local devices=2"
-    assert [commands._devices(words.split()) for words in lines] == [2, None, 1, 2]
+    assert [commands._devices(words.split()) for words in lines] == [2, None, None, 2]

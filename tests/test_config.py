@@ -91,6 +91,8 @@ def test_evaluate_trains_the_agents_that_a_proxy_was_learned_with(name):
     config = evaluation([f"proxy={name}"])
     learned = sejax.load_proxy(name).learned_agents()
     assert config.agents == learned and config.agent_hparams == "as_learned"
+    changed = evaluation([f"proxy={name}", "agent.discount=0.5"]).agents
+    assert changed == {k: dataclasses.replace(x, discount=0.5) for k, x in learned.items()}
     for key, agent in learned.items():  # as one that is named, too
         words = [f"proxy={name}", f"agent={key}"]
         changed = evaluation([*words, "agent.discount=0.5"]).agent
@@ -215,8 +217,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("es.score_transform=rank.py:f", "es.score_transform", "es.score_transform=rank:f."),
     ("agent=no_module_of:mine", "agent", "PYTHONPATH"), (f"agent=a:{'d' * 5000}", "agent", ""),
     ("agents=[ddqn,td3_discret]", "agents.td3_discret", "td3_discrete"),
-    ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
-    ("agents=[ddqn,ppo] agent.clip_ratio=1", "agent.clip_ratio", "agents.ppo.clip_ratio=1"),
+    ("agents=[ddqn,ppo] agent.clip_ratio=1", "agents.ddqn.clip_ratio", "of agents.ddqn=ppo."),
     ("agents=[ddqn,ppo] agents.ppo.tau=1", "agents.ppo.tau", "of agents.ppo=ddqn, "),
     ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
     ("agents=[ddqn,ppo] agents.ppo.epoch=3", "agents.ppo.epoch", "agents.ppo.epochs?"),
@@ -259,7 +260,7 @@ def test_a_configuration_made_in_python_holds_configurations(part):
     ("proxy=real training_from=config", "training_from"), ("proxy=cartpole seed=-1", "seed"),
     ("proxy=real env=cartpole training.max_steps=9", "training"),
     ("proxy=cartpole agent_hparams=as_learned agents=[ddqn,sac]", "agents"),
-    ("proxy=cartpole agent.discount=0.5", "agent.discount"), ("proxy=real env.length=2", "env"),
+    ("proxy=real env.length=2", "env"),
     ("proxy=cartpole training.max_steps=2000", "training"), ("proxy=cartpole agent=2", "agent"),
     ("proxy=cartpole generations=3", "generations"), ("proxy=cartpole num_agents=0", "num_agents"),
     ("proxy=cartpole agents=[ddqn,ppo] mixture.weights.ppo=2", "mixture.weights.ppo"),

@@ -71,14 +71,18 @@ class ConfigError(ValueError):
 
     def __init__(self, field: str, rule: str, **details: Unpack[Details]):
         super().__init__(field, rule)  # by which it is made again in another process
-        self.field, self.rule = field, rule
+        self.field = field
+        self.rule = rule
         self.details = {name: shortened(x) if name == "got" else x for name, x in details.items()}
 
     def __str__(self) -> str:
-        message, details = f"{self.field} {self.rule}".lstrip(), self.details
+        message = f"{self.field} {self.rule}".lstrip()
+        details = self.details
+        if not details:
+            return message
         message += f"; got {details['got']}" if "got" in details else ""
         fix = f"Set {self.field}={details['use']}." if "use" in details else details.get("fix", "")
-        return f"{message}. {fix}".rstrip() if details else message
+        return f"{message}. {fix}".rstrip()
 
 
 class FailedError(RuntimeError):
@@ -135,8 +139,8 @@ def nearest(got: str, known: Iterable[str]) -> list[str]:
 
 def listed(names: Collection[str]) -> str:
     """Names with commas between, as many as fit into 120 characters."""
-    text, more = ", ".join(names) or "none", " and more"
-    return textwrap.shorten(text, 120, placeholder=more, break_on_hyphens=False)
+    text = ", ".join(names) or "none"
+    return textwrap.shorten(text, 120, placeholder=" and more", break_on_hyphens=False)
 
 
 def shortened(value: object, length: int = 80) -> str:
@@ -147,7 +151,8 @@ def shortened(value: object, length: int = 80) -> str:
 
 def told(error: BaseException) -> str:
     """An error of other code on one line: its kind, its message, its place in a user's file."""
-    line, text = place_of(error), shortened(" ".join(str(error).split()), 120)
+    line = place_of(error)
+    text = shortened(" ".join(str(error).split()), 120)
     classes = [cls.__name__ for cls in type(error).__mro__]
     # jax's errors for a value that is unknown while tracing; their texts describe jax's internals.
     if any(name.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for name in classes):
@@ -283,7 +288,8 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
     if isinstance(got, Mapping):
         raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.")
     if must == "be a valid tuple":
-        must, use = "be a list in brackets", f"[{shortened(got, 20)}]"
+        must = "be a list in brackets"
+        use = f"[{shortened(got, 20)}]"
     raise ConfigError(name, f"must {must}", got=repr(got), use=use)
 
 

@@ -118,7 +118,9 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     Raises:
       ConfigError: for an unknown field, a missing one, or a value of another type.
     """
-    hints, defaults, fields = hints_of(cls, where), defaults_of(cls), {}
+    hints = hints_of(cls, where)
+    defaults = defaults_of(cls)
+    fields = {}
     group = getattr(cls, "group", where)
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
@@ -168,7 +170,8 @@ def defaults_of(cls: type) -> dict[str, Any]:
 
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """The error for an unknown field, with the nearest known fields."""
-    field, last = shortened(field, 40), field.rpartition(".")[2]
+    last = field.rpartition(".")[2]
+    field = shortened(field, 40)
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""

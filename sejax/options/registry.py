@@ -173,10 +173,10 @@ def find(group: str, name: str) -> Any:
     plugin = imported(group, path or name)
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
-    base, arguments = resolve_name(GROUPS[group].base), GROUPS[group].arguments
+    base = resolve_name(GROUPS[group].base)
     is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
     is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a dataclass with make({', '.join(arguments)})"
+    must = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
     must += f" that derives from {base.__module__}.{base.__name__}"
     require(is_fit, group, must, got=f"{shortened(name, 40)}, which is {plugin}")
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
@@ -313,7 +313,8 @@ def imported(field: str, path: str) -> Any:
 @functools.cache
 def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass for a function: its fields are the parameters after the group's arguments."""
-    arguments, signature = GROUPS[group].arguments, inspect.signature(function)
+    arguments = GROUPS[group].arguments
+    signature = inspect.signature(function)
     parameters = list(signature.parameters.values())
     options = parameters[len(arguments) :]
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)

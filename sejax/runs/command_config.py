@@ -45,8 +45,6 @@ from sejax.proxies import ProxyConfig
 from sejax.runs.words import Tree, as_typed, expand, names_of, settled, trees_of
 from sejax.training import TrainingConfig, require_reachable
 
-# Fields of `sejax.run` that no other command has.
-OF_RUNS = ("mixture", "generations", "num_seeds", "stop_when_solved", "checkpoint_every")
 PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
 
 
@@ -122,7 +120,8 @@ class CommandConfig(Options, ABC):
           ConfigError: as `of_words`.
         """
         by_name = {override.partition("=")[0]: override for override in overrides}
-        overrides, configs = [*by_name.values()], []  # of words with one name the last counts
+        overrides = [*by_name.values()]  # of words with one name the last counts
+        configs = []
         for of_run in expand(overrides):
             config = cls.of_words(of_run)
             folder = getattr(config, cls.folder_field)
@@ -148,13 +147,14 @@ class CommandConfig(Options, ABC):
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
         trees = trees_of(overrides, cls.groups())
-        typed, code = merge(*trees), code_in(trees[-1]).values()
+        typed = merge(*trees)
+        code = code_in(trees[-1]).values()
         require_typed(typed, code)
         layers = cls.layers_below(typed)
         below = merge(*layers.values())
         require_typed(below, code)
-        names = names_of(below["agents"])
-        return layers | {"typed": merge(*(settled(tree, names) for tree in trees))}
+        agent_names = names_of(below["agents"])
+        return layers | {"typed": merge(*(settled(tree, agent_names) for tree in trees))}
 
     @classmethod
     def of_tree(cls, tree: Tree) -> Self:
@@ -172,8 +172,6 @@ class CommandConfig(Options, ABC):
         unknown = {k: x for k, x in tree.items() if k not in known and (k, x) not in gone}
         if unknown:
             name = next(iter(flatten(unknown) or unknown))
-            is_elsewhere = name.partition(".")[0] in {*registry.GROUPS, *OF_RUNS}
-            require(not is_elsewhere, shortened(name, 40), "is no field here. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 
@@ -220,17 +218,19 @@ class CommandConfig(Options, ABC):
         Raises:
           ConfigError: if it would learn nothing.
         """
-        longest, got = proxy.max_steps(spec.max_steps), training.solved_by
+        longest = proxy.max_steps(spec.max_steps)
         require_reachable(group, training, longest)
-        is_tested = training.stop_rule != "solved" or got == "test"
-        require(is_tested, f"{group}.solved_by", "must be test on a proxy", got=got, use="test")
+        judge = training.solved_by
+        is_tested = training.stop_rule != "solved" or judge == "test"
+        require(is_tested, f"{group}.solved_by", "must be test on a proxy", got=judge, use="test")
         # The shortest episodes: of other proxies they may have one step.
         shortest = longest if proxy.reaches_step_limit else 1
         for name, length, unit in (("max_steps", shortest, 1), ("max_episodes", longest, longest)):
             least = self.agents[key].steps_before_learning(length, spec.max_steps) // unit
-            limit, field = getattr(training, name), f"{group}.{name}"
+            limit = getattr(training, name)
+            is_longer = limit is None or limit > least
             must = f"must exceed {least}, where {shortened(key)} begins to learn"
-            require(limit is None or limit > least, field, must, got=limit, use=4 * least)
+            require(is_longer, f"{group}.{name}", must, got=limit, use=4 * least)
 
 
 Config = TypeVar("Config", bound=CommandConfig)
@@ -243,7 +243,7 @@ def apart(configs: Sequence[Config]) -> list[Config]:
       ConfigError: if two that differ share a folder.
     """
     by_folder = {str(config.folder): config for config in configs}
-    must, got = "must differ for each run in letters or digits", next(iter(by_folder), "")
     are_apart = len(by_folder) == len({str(config) for config in configs})
-    require(are_apart, configs[0].folder_field, must, got=got)
+    must = "must differ for each run in letters or digits"
+    require(are_apart, configs[0].folder_field, must, got=next(iter(by_folder), ""))
     return [*by_folder.values()]

@@ -21,7 +21,7 @@ from sejax.options import ConfigError, FailedError, as_text, place_of, registry,
 from sejax.options.plain import merge
 from sejax.runs import presets, runtime
 from sejax.runs.command_config import CommandConfig
-from sejax.runs.words import expand, trees_of
+from sejax.runs.words import expand
 
 BAD_INPUT, FAILED, INTERRUPTED, CLOSED = 2, 1, 130, 141  # as shells give SIGINT and SIGPIPE
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -72,7 +72,8 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
     If a value is not the default, the layer that sets it stands beside it.
     """
     overrides = [*command.granted, *expand(overrides)[0]]  # the first run of a sweep
-    layers, choices = command.layers_of(overrides), ("agent", *command.groups())
+    choices = ("agent", *command.groups())
+    layers = command.layers_of(overrides)
     tree = merge(*layers.values())
     config = command.of_tree(tree)
     lines = [str(about), "Choices (group=choice):"]
@@ -137,16 +138,10 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _devices(overrides: Sequence[str]) -> int | None:
-    """The largest number of `devices=`; 1 if other machines compute the trainings."""
-    with contextlib.suppress(ConfigError):  # the command raises it later
-        known = ("devices", "machines", "machines.name", "preset")  # which may tell
-        overrides = [word for word in overrides if word.partition("=")[0] in known]
-        trees = [merge(*trees_of(x, ["machines"])) for x in expand(overrides)]
-        here = [tree.get("machines", {}).get("name", "local") == "local" for tree in trees]
-        counts = [str(x.get("devices", "")) if y else "1" for x, y in zip(trees, here, strict=True)]
-        if all(re.fullmatch(r"[1-9]\d{0,3}", count) for count in counts):
-            return max(map(int, counts))
-    return None
+    """The largest number that words `devices=` ask for, before these are checked; None without."""
+    texts = [word.removeprefix("devices=") for word in overrides if word.startswith("devices=")]
+    counts = re.findall(r"\b[1-9]\d{0,3}\b", ",".join(texts))
+    return max(map(int, counts), default=None)
 
 
 @contextlib.contextmanager

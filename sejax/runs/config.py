@@ -94,9 +94,11 @@ class LearnConfig(CommandConfig):
         super().__post_init__()
         is_here = self.devices is None or not self.machines.is_elsewhere
         require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
-        spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
+        spec = envs.spec_of(self.env)
+        task_name = registry.name_of("env", self.env)
         self.proxy.require_task(spec, task_name)
-        is_alone, given = len(self.agents) == 1, self.mixture.weights
+        is_alone = len(self.agents) == 1
+        given = self.mixture.weights
         is_idle = is_alone and self.mixture != MixtureConfig()
         require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
         if unknown := given.keys() - self.agents.keys():
@@ -136,7 +138,8 @@ class LearnConfig(CommandConfig):
 
     def parts(self) -> dict[str, Any]:
         """The arguments of `sejax.make_learner`: objects, or configurations that make them."""
-        task, is_varied = self.task(), self.agent_hparams == "varied"
+        task = self.task()
+        is_varied = self.agent_hparams == "varied"
         learners = tuple(self.agent_for(key, task, is_varied) for key in self.agents)
         mixture = Mixture(
             agents=learners,
@@ -171,9 +174,8 @@ class LearnConfig(CommandConfig):
     def default_folder(self) -> str:
         """The run directory, named by the fields of `named_by`."""
         name = "-".join(map(self.name, ("env", "proxy", "agent")))
-        explored, varied = self.name("exploration"), self.agent_hparams
-        name += f"_{explored}" if explored != "none" else ""
-        name += f"_{varied}" if varied != "default" else ""
+        for part, usual in ((self.name("exploration"), "none"), (self.agent_hparams, "default")):
+            name += f"_{part}" if part != usual else ""
         return f"runs/{as_file_name(f'{name}-s{self.seed}')}"
 
 

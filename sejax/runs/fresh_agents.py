@@ -89,9 +89,11 @@ class FreshAgentsConfig(CommandConfig):
         is_default = merge({"training": printed}, typed)["training"] == printed
         is_used = is_default or typed.get("training_from") == "config"
         require(is_used, "training", "must come with training_from=config, or be real_training.*.")
-        names, hparams = names_of(typed["agents"]), typed.get("agent_hparams")
+        names = names_of(typed["agents"])
+        hparams = typed.get("agent_hparams")
         is_as_learned = hparams == "as_learned" or (not names and hparams is None)
-        stored, learned = None, Tree()
+        stored = None
+        learned = Tree()
         with contextlib.suppress(ConfigError):  # loading the proxy raises it later
             if typed["proxy"] != "real":
                 stored = header.read(str(typed["proxy"]), "proxy").header
@@ -145,7 +147,8 @@ def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
     require(is_given, "env", "must be given with proxy=real. Set env=cartpole.")
     proxy = None if config.proxy == "real" else loaded(config)
     task = envs.make(str(config.env)) if proxy is None else proxy.task
-    real_training, trainings = config.real_training, {}
+    real_training = config.real_training
+    trainings = {}
     for key, agent in config.agents.items():
         agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
         group, training = "real_training", real_training

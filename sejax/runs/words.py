@@ -10,23 +10,23 @@ words                                   tree
 ======================================= =======================================================
 `agent=ddqn`, `agents=[ddqn,ppo]`       `{"agents": {"ddqn": {"name": "ddqn"}, ...}}`
 `agents.big=ddqn agents.big.tau=0.1`    `{"agents": {"big": {"name": "ddqn", "tau": "0.1"}}}`
-`agent.tau=0.1`, of an only agent       `{"agent": {"tau": "0.1"}}`, until its key is known; then
-                                        `{"agents": {"ddqn": {"tau": "0.1"}}}` (`settled`)
+`agent.tau=0.1`, of all agents          `{"agent": {"tau": "0.1"}}`, until their keys are known;
+                                        then `{"agents": {"ddqn": {"tau": "0.1"}}}` (`settled`)
 ======================================= =======================================================
 
-Messages and `--help` name an only agent's fields as in the last row (`as_typed`).
+Messages and `--help` name an only agent's fields as `agent.tau` (`as_typed`).
 """
 
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import yaml
 
 from sejax.options import ConfigError, old, registry, require, shortened
-from sejax.options.plain import defaults_of, expanded, flatten, merge, split, unquoted
+from sejax.options.plain import expanded, flatten, merge, split, unquoted
 
 Tree: TypeAlias = dict[str, Any]  # nested plain values
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
@@ -86,7 +86,8 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
     texts: Tree = {name: unquoted(text) for name, text in texts_of(overrides).items()}
     if not texts.get("preset", "").endswith((".yaml", ".yml")):
         return [_tree(texts, groups)]
-    path, typed = Path(expanded(texts.pop("preset"))), _tree(texts, groups)
+    path = Path(expanded(texts.pop("preset")))
+    typed = _tree(texts, groups)
     try:
         values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
@@ -107,7 +108,8 @@ def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
     """Values by their names in words as a tree; see above for agents."""
     tree: Tree = {"agents": chosen(values)}
     for name in [name for name in values if name not in CHOOSE_ALL]:
-        value, is_choice = values[name], name in groups or BY_KEY.fullmatch(name)
+        value = values[name]
+        is_choice = name in groups or BY_KEY.fullmatch(name)
         for part in reversed([*name.split("."), *(["name"] if is_choice else [])]):
             value = {part: value}
         tree = merge(tree, value)
@@ -177,25 +179,20 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
     return file
 
 
-def settled(tree: Tree, names: Mapping[str, str]) -> Tree:
-    """The tree with the fields of `agent` under the only agent's key.
+def settled(tree: Tree, keys: Iterable[str]) -> Tree:
+    """The tree with the fields of `agent` under each agent's key, below the agent's own fields.
 
     Args:
       tree: of words, or of a file.
-      names: names of the chosen agents by key.
+      keys: of the chosen agents.
 
-    Raises:
-      ConfigError: if there are such fields, and several agents.
+    Example:
+      >>> settled({"agents": {"ddqn": {"tau": "1"}}, "agent": {"tau": "0.1"}}, ["ddqn", "td3"])
+      {'agents': {'ddqn': {'tau': '1'}, 'td3': {'tau': '0.1'}}}
     """
-    fields, key = tree.get("agent", {}), next(iter(names))
-    if fields and len(names) > 1:
-        field, value = next(iter(flatten(fields).items()))
-        classes = {key: registry.find("agent", name) for key, name in names.items()}
-        having = [key for key, x in classes.items() if field.split(".")[0] in defaults_of(x)]
-        fix = f"Set agents.{(having or [key])[0]}.{field:.40}={shortened(value, 40)}."
-        raise ConfigError(f"agent.{field:.40}", "must be one agent's", got=value, fix=fix)
     others = {name: x for name, x in tree.items() if name != "agent"}
-    return others | {"agents": merge(tree["agents"], {key: fields})}
+    of_all = dict.fromkeys(keys, tree.get("agent", {}))
+    return others | {"agents": merge(of_all, tree["agents"])}
 
 
 def as_typed(name: str, keys: Collection[str]) -> str:
