@@ -164,18 +164,20 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
       typed: the words' tree.
       is_whole: whether words choose all agents; `agents.KEY=ppo` chooses one.
     """
-    named = file["agents"]
-    if len(named) == 1:
-        file["agents"] = named = {key: merge(x, file.pop("agent", {})) for key, x in named.items()}
-    if names := names_of(typed["agents"]):
-        keys = names.keys() if is_whole else named.keys() | names.keys()
-        others = {k for k, x in names_of(named).items() if names.get(k, x) != x}
-        file["agents"] = {key: x for key, x in named.items() if key in keys - others}
-        mixture = dict(file.pop("mixture", {}))
-        weights = {key: x for key, x in mixture.pop("weights", {}).items() if key in keys}
-        if len(keys) > 1:
-            file |= {"mixture": mixture | {"weights": weights}} if mixture or weights else {}
-            file.pop("agent", None)
+    typed_names = names_of(typed["agents"])
+    if not typed_names:
+        return file
+    agents = file["agents"]
+    if agents:
+        file = settled(file, agents)  # `agent.FIELD` of the file is of the file's agents
+        agents = file["agents"]
+    keys = typed_names.keys() if is_whole else agents.keys() | typed_names.keys()
+    replaced = {k for k, name in names_of(agents).items() if typed_names.get(k, name) != name}
+    file["agents"] = {key: x for key, x in agents.items() if key in keys - replaced}
+    mixture = file.pop("mixture", {})
+    if mixture and len(keys) > 1:
+        weights = {key: x for key, x in mixture.get("weights", {}).items() if key in keys}
+        file["mixture"] = {**mixture, "weights": weights}
     return file
 
 
