@@ -22,7 +22,7 @@ from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import require
 from sejax.proxies import header, hub
 from sejax.runs import commands, fresh_agents, runtime
-from sejax.runs.command_config import apart
+from sejax.runs.command_config import without_repetitions
 from sejax.runs.fresh_agents import FreshAgentsConfig, World
 
 
@@ -83,7 +83,7 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     configs = EvaluateConfig.of_sweep(overrides)
     if len(configs) > 1:
         configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
-    return apart(configs)
+    return without_repetitions(configs)
 
 
 def evaluate(config: EvaluateConfig) -> float:

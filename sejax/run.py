@@ -20,7 +20,7 @@ from pathlib import Path
 from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
 from sejax.runs import commands, runtime, session
-from sejax.runs.command_config import apart
+from sejax.runs.command_config import without_repetitions
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
@@ -48,7 +48,7 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
             if folder and config.num_seeds > 1:
                 folder = f"{folder}/seed{seed}"
             runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    return apart(runs)
+    return without_repetitions(runs)
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:

@@ -42,7 +42,7 @@ from sejax.options.plain import (
     unknown_field,
 )
 from sejax.proxies import ProxyConfig
-from sejax.runs.words import Tree, as_typed, expand, names_of, settled, trees_of
+from sejax.runs.words import Tree, by_agent, expand, names_of, trees_of, typed_name
 from sejax.training import TrainingConfig, require_reachable
 
 PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
@@ -154,7 +154,7 @@ class CommandConfig(Options, ABC):
         below = merge(*layers.values())
         require_typed(below, code)
         agent_names = names_of(below["agents"])
-        return layers | {"typed": merge(*(settled(tree, agent_names) for tree in trees))}
+        return layers | {"typed": merge(*(by_agent(tree, agent_names) for tree in trees))}
 
     @classmethod
     def of_tree(cls, tree: Tree) -> Self:
@@ -183,7 +183,7 @@ class CommandConfig(Options, ABC):
 
     def field_of(self, key: str) -> str:
         """The group of an agent's fields in words: `agent`, or `agents.KEY` of several."""
-        return as_typed(f"agents.{key}", self.agents)
+        return typed_name(f"agents.{key}", self.agents)
 
     def agent_for(self, key: str, task: envs.Task, is_varied: bool) -> Agent:
         """The agent of a key, with the exploration, for a task; see `sejax.make_agent`."""
@@ -196,7 +196,7 @@ class CommandConfig(Options, ABC):
 
     def named(self, tree: Tree) -> dict[str, Any]:
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
-        flat = {as_typed(name, self.agents): x for name, x in flatten(tree).items()}
+        flat = {typed_name(name, self.agents): x for name, x in flatten(tree).items()}
         return {name.removesuffix(".name"): x for name, x in flat.items()}
 
     def require_learning(
@@ -236,7 +236,7 @@ class CommandConfig(Options, ABC):
 Config = TypeVar("Config", bound=CommandConfig)
 
 
-def apart(configs: Sequence[Config]) -> list[Config]:
+def without_repetitions(configs: Sequence[Config]) -> list[Config]:
     """Configurations without repetitions, each with a folder of its own.
 
     Raises:

@@ -113,7 +113,8 @@ class FreshAgentsConfig(CommandConfig):
             name = agents.default_for(stored.spec) if stored else default_agent(env)
             names = {name: name}
         known = learned.get("agents", {}) if hparams is None else {}
-        return {"proxy": {"agents": {key: like(known, key, name) for key, name in names.items()}}}
+        of_agents = {key: agent_like(known, key, name) for key, name in names.items()}
+        return {"proxy": {"agents": of_agents}}
 
 
 def learned_layer(config: Mapping[str, Any]) -> Tree:
@@ -130,7 +131,7 @@ def learned_layer(config: Mapping[str, Any]) -> Tree:
     return {"agents": config["agents"], "exploration": explored, "real_training": real_training}
 
 
-def like(known: Mapping[str, Tree], key: str, name: str) -> Tree:
+def agent_like(known: Mapping[str, Tree], key: str, name: str) -> Tree:
     """An agent with the hyperparameters of the known one of its name; of several, of its key."""
     same = {k: agent for k, agent in known.items() if agent["name"] == name}
     return same.get(key) or next(iter(same.values()), {"name": name})

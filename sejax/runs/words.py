@@ -11,10 +11,10 @@ words                                   tree
 `agent=ddqn`, `agents=[ddqn,ppo]`       `{"agents": {"ddqn": {"name": "ddqn"}, ...}}`
 `agents.big=ddqn agents.big.tau=0.1`    `{"agents": {"big": {"name": "ddqn", "tau": "0.1"}}}`
 `agent.tau=0.1`, of all agents          `{"agent": {"tau": "0.1"}}`, until their keys are known;
-                                        then `{"agents": {"ddqn": {"tau": "0.1"}}}` (`settled`)
+                                        then `{"agents": {"ddqn": {"tau": "0.1"}}}` (`by_agent`)
 ======================================= =======================================================
 
-Messages and `--help` name an only agent's fields as `agent.tau` (`as_typed`).
+Messages and `--help` name an only agent's fields as `agent.tau` (`typed_name`).
 """
 
 import itertools
@@ -96,7 +96,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
             if name is not None and file.get(group, {}).get("name", name) != name:
                 del file[group]
         is_whole = bool(CHOOSE_ALL & texts.keys())
-        return [without_replaced(file, typed, is_whole), typed]
+        return [drop_replaced(file, typed, is_whole), typed]
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -106,7 +106,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
     """Values by their names in words as a tree; see above for agents."""
-    tree: Tree = {"agents": chosen(values)}
+    tree: Tree = {"agents": chosen_agents(values)}
     for name in [name for name in values if name not in CHOOSE_ALL]:
         value = values[name]
         is_choice = name in groups or BY_KEY.fullmatch(name)
@@ -131,7 +131,7 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
 # --- agents ---------------------------------------------------------------------------------------
 
 
-def chosen(values: Mapping[str, Any]) -> Tree:
+def chosen_agents(values: Mapping[str, Any]) -> Tree:
     """The agents that `agent=ddqn` or `agents=[ddqn,ppo]` choose, by key.
 
     Raises:
@@ -156,7 +156,7 @@ def names_of(agents: Mapping[str, Any]) -> dict[str, str]:
     return {key: str(x["name"]) for key, x in named.items()}
 
 
-def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
+def drop_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
     """The tree of a file without the agents, and their weights, that typed choices replace.
 
     Args:
@@ -167,10 +167,9 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
     typed_names = names_of(typed["agents"])
     if not typed_names:
         return file
+    if file["agents"]:
+        file = by_agent(file, file["agents"])  # the file's `agent.FIELD` are of its own agents
     agents = file["agents"]
-    if agents:
-        file = settled(file, agents)  # `agent.FIELD` of the file is of the file's agents
-        agents = file["agents"]
     keys = typed_names.keys() if is_whole else agents.keys() | typed_names.keys()
     replaced = {k for k, name in names_of(agents).items() if typed_names.get(k, name) != name}
     file["agents"] = {key: x for key, x in agents.items() if key in keys - replaced}
@@ -181,7 +180,7 @@ def without_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
     return file
 
 
-def settled(tree: Tree, keys: Iterable[str]) -> Tree:
+def by_agent(tree: Tree, keys: Iterable[str]) -> Tree:
     """The tree with the fields of `agent` under each agent's key, below the agent's own fields.
 
     Args:
@@ -189,7 +188,7 @@ def settled(tree: Tree, keys: Iterable[str]) -> Tree:
       keys: of the chosen agents.
 
     Example:
-      >>> settled({"agents": {"ddqn": {"tau": "1"}}, "agent": {"tau": "0.1"}}, ["ddqn", "td3"])
+      >>> by_agent({"agents": {"ddqn": {"tau": "1"}}, "agent": {"tau": "0.1"}}, ["ddqn", "td3"])
       {'agents': {'ddqn': {'tau': '1'}, 'td3': {'tau': '0.1'}}}
     """
     others = {name: x for name, x in tree.items() if name != "agent"}
@@ -197,11 +196,11 @@ def settled(tree: Tree, keys: Iterable[str]) -> Tree:
     return others | {"agents": merge(of_all, tree["agents"])}
 
 
-def as_typed(name: str, keys: Collection[str]) -> str:
+def typed_name(name: str, keys: Collection[str]) -> str:
     """A field's name as a user types it, with agents of these keys.
 
     Example:
-      >>> as_typed("agents.ddqn.tau", ["ddqn"]), as_typed("agents.ddqn.tau", ["ddqn", "ppo"])
+      >>> typed_name("agents.ddqn.tau", ["ddqn"]), typed_name("agents.ddqn.tau", ["ddqn", "ppo"])
       ('agent.tau', 'agents.ddqn.tau')
     """
     prefix = f"agents.{next(iter(keys), '')}"
