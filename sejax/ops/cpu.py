@@ -16,12 +16,14 @@ SMALL_NUM_PARALLEL = 8
 
 # If hyperparameters vary, a batch is cut into about NUM_BLOCKS blocks of MIN_BLOCK columns or more:
 # enough blocks to waste little, and blocks large enough for efficient products.
-NUM_BLOCKS, MIN_BLOCK = 4, 32
+NUM_BLOCKS = 4
+MIN_BLOCK = 32
 
 # Numbers of network sizes that varied agents choose from, for one hidden layer and for more. Units
 # that are switched off cost time: in proportion to the layer's size with one hidden layer, and to
 # its square with more.
-NUM_SIZES, NUM_SIZES_DEEP = 6, 12
+NUM_SIZES = 6
+NUM_SIZES_DEEP = 12
 
 
 def width_of(num_agents: int) -> int:

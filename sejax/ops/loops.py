@@ -99,7 +99,7 @@ def _while_any_active(
             return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
 
         def block(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-            return jax.lax.fori_loop(0, per_check, lambda _, each: step(each), carry)
+            return jax.lax.fori_loop(0, per_check, lambda _, carry: step(carry), carry)
 
         def advance(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             if depth == 0:  # no block: its steps after the loop's end would not be masked

@@ -44,12 +44,9 @@ def _rational_tanh(
     return tanh
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array | float:
+def _polynomial(coefficients: tuple[Array | float, ...], x: Array) -> Array | float:
     """A polynomial by Horner's scheme; the coefficient of the lowest power comes first."""
-    value: Array | float = coefficients[-1]
-    for coefficient in reversed(coefficients[:-1]):
-        value = value * x + coefficient
-    return value
+    return functools.reduce(lambda value, c: value * x + c, reversed(coefficients))
 
 
 # Coefficients: linear programs found the function nearest to tanh up to the cut, of this form and
@@ -69,6 +66,7 @@ fast_tanh = _rational_tanh(
     (1.0, 0.45653853, 2.11477332e-2, 1.4388554e-4),
     cut=7.0,
 )
+_ACTIVATIONS = {"tanh": tanh, "fast_tanh": fast_tanh, "relu": nn.relu, "leaky_relu": nn.leaky_relu}
 
 
 def uniform_fan_in(fan_in: int) -> Callable[..., Array]:
@@ -77,11 +75,7 @@ def uniform_fan_in(fan_in: int) -> Callable[..., Array]:
     Source: the default of the paper's networks (`docs/reference.md` 1.9).
     """
     bound = fan_in**-0.5
-
-    def init(key: Array, shape: tuple[int, ...]) -> Array:
-        return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
-
-    return init
+    return functools.partial(jax.random.uniform, minval=-bound, maxval=bound)
 
 
 class Dense(nn.Module):
@@ -143,8 +137,8 @@ def _transposed_product(
     Plain form: `kernel.T @ gradient`. With a wide kernel the library computes the plain form at 0.4
     of the speed of a product without transposition. Barriers keep XLA from restoring that form.
     """
-    (num_outputs, num_inputs), batch = kernel.shape, gradient.shape[1]
-    if min(num_outputs, num_inputs) < _WIDE or batch >= 2 * num_outputs:
+    num_outputs = kernel.shape[0]
+    if min(kernel.shape) < _WIDE or gradient.shape[1] >= 2 * num_outputs:
         return _product(kernel.T, gradient)
     return jax.lax.optimization_barrier(jax.lax.optimization_barrier(gradient.T) @ kernel).T
 
@@ -209,9 +203,7 @@ class MLP(nn.Module):
             if self.learn_prelu_slope:
                 slope = self.param("prelu_slope", nn.initializers.constant(PRELU_SLOPE), ())
             return lambda x: jnp.where(x >= 0, x, slope * x)
-        return {"tanh": tanh, "fast_tanh": fast_tanh, "relu": nn.relu, "leaky_relu": nn.leaky_relu}[
-            self.activation
-        ]
+        return _ACTIVATIONS[self.activation]
 
 
 def init_narrowed(
@@ -241,11 +233,14 @@ def narrow(params: dict[str, PyTree], hidden_size: Array) -> dict[str, PyTree]:
     widen = jnp.sqrt(full_size / hidden_size)  # weights are uniform in +-1/sqrt(fan_in)
     narrowed = dict(params)
     for layer in range(num_layers):
-        kernel, bias = params[f"Dense_{layer}"]["kernel"], params[f"Dense_{layer}"]["bias"]
+        kernel = params[f"Dense_{layer}"]["kernel"]
+        bias = params[f"Dense_{layer}"]["bias"]
         if layer > 0:
-            kernel, bias = kernel * in_use[None, :] * widen, bias * widen
+            kernel = kernel * in_use[None, :] * widen
+            bias = bias * widen
         if layer < num_layers - 1:
-            kernel, bias = kernel * in_use[:, None], bias * in_use
+            kernel = kernel * in_use[:, None]
+            bias = bias * in_use
         narrowed[f"Dense_{layer}"] = {"kernel": kernel, "bias": bias}
     if "width" in params:
         narrowed["width"] = jnp.float32(hidden_size)
@@ -273,5 +268,6 @@ class DuelingMLP(nn.Module):
 
     def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "actions *batch"]:
         features = self.features(x)
-        value, advantage = self.value(features), self.advantage(features)  # value: [1, *batch]
+        value = self.value(features)  # [1, *batch]
+        advantage = self.advantage(features)
         return value + advantage - jnp.mean(advantage, axis=0, keepdims=True)

@@ -31,7 +31,7 @@ def compiler_options() -> dict[str, int] | None:
     vectors round differently, so that numbers differ in their last bits.
     """
     options = {"xla_cpu_prefer_vector_width": 512}
-    if jax.devices()[0].platform != "cpu":
+    if not on_cpu():
         return None
     try:
         jax.jit(lambda: jnp.int32(0), compiler_options=options).lower().compile()
@@ -117,10 +117,9 @@ def spread_groups_over_devices(
     """
     for name, count in (("devices", num_devices), ("num_parallel", num_parallel)):
         checked(count, Count, name, None)
-    available = jax.devices()
-    most = len(available)
-    is_fit = num_devices is None or num_devices <= most
-    require(is_fit, "devices", f"must be at most {most}", got=num_devices, use="null")
+    available = jax.device_count()
+    is_fit = num_devices is None or num_devices <= available
+    require(is_fit, "devices", f"must be at most {available}", got=num_devices, use="null")
     mesh = _mesh(num_devices)
     widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 
@@ -195,19 +194,17 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
 
     @one.def_vmap
     def _(size: int, in_batched: list[PyTree], args: tuple[PyTree, ...]) -> tuple[T, PyTree]:
-        is_batched = jax.tree.leaves(in_batched)
-
         def all_of_them(*args: PyTree) -> T:
-            leaves, structure = jax.tree.flatten(args)
+            # None, which is no leaf, stands for an array that all elements share.
+            varied = jax.tree.map(lambda x, varies: x if varies else None, args, in_batched[0])
 
-            def run(*elements: Array) -> T:
-                rest = iter(elements)
-                pairs = zip(is_batched, leaves, strict=True)
-                whole = [next(rest) if x else leaf for x, leaf in pairs]
-                return fn(*jax.tree.unflatten(structure, whole))
+            def or_shared(x: Array | None, shared: Array) -> Array:
+                return shared if x is None else x
 
-            batched = tuple(leaf for x, leaf in zip(is_batched, leaves, strict=True) if x)
-            return map_in_batches(run, min(width or size, size), batched)
+            def run(*element: PyTree) -> T:
+                return fn(*jax.tree.map(or_shared, element, args, is_leaf=lambda x: x is None))
+
+            return map_in_batches(run, min(width or size, size), varied)
 
         # Under a second `vmap` the maps run one after the other.
         out = in_batches_on_cpu(all_of_them, width and 1)(*args)

@@ -67,7 +67,8 @@ def or_lowest_finite(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def below_all(scores: Float[Array, "*n"]) -> Float[Array, ""]:
     """A score below the finite ones, by their range and at least by what 32 bits can tell."""
     scores = or_lowest_finite(scores)
-    lowest, gap = scores.min(), scores.max() - scores.min()
+    lowest = scores.min()
+    gap = scores.max() - scores.min()
     return lowest - jnp.maximum(gap, _TIE * jnp.maximum(1e6, jnp.abs(lowest)))
 
 
@@ -77,8 +78,10 @@ def merged_moments(moments: Moments, others: Moments) -> Moments:
     Source: Chan et al., "Updating formulae and a pairwise algorithm for computing sample variances"
     (1979).
     """
-    (count, mean, square), (count_others, mean_others, square_others) = moments, others
+    count, mean, square = moments
+    count_others, mean_others, square_others = others
     total = count + count_others
-    apart, share = mean_others - mean, count_others / jnp.maximum(total, 1)
-    square = square + square_others + apart**2 * count * share
-    return total, mean + apart * share, square
+    difference = mean_others - mean
+    share = count_others / jnp.maximum(total, 1)
+    square = square + square_others + difference**2 * count * share
+    return total, mean + difference * share, square
