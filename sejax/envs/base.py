@@ -68,33 +68,33 @@ class Task(TaskSpec):
     action: Space = field(init=False)
 
     def __post_init__(self) -> None:
-        params, env, name = self.params, self.env, self.name
         solved_reward = options.as_python(self.solved_reward)
         is_nan = type(solved_reward) in (int, float) and math.isnan(solved_reward)
         is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
-        field = "env.solved_reward"
-        options.require(is_known, field, "must be a number", got=solved_reward, use="inf")
+        rule = "must be a number"
+        options.require(is_known, "env.solved_reward", rule, got=solved_reward, use="inf")
         try:
-            params = env.default_params if params is None else params
+            params = self.env.default_params if self.params is None else self.params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = options.checked(limit, options.Count, "env.max_steps", 200)
             if params.max_steps_in_episode != max_steps:
                 params = dataclasses.replace(params, max_steps_in_episode=max_steps)
-            require_own_steps(env)
-            vectors = as_vectors(env, params)
-            observation, action = spaces_of(vectors, params)
-            sizes = [[(type(x), x.size) for x in spaces_of(vectors, y)] for y in (None, params)]
-            options.require(sizes[0] == sizes[1], "env", "needs its own default_params", got=name)
-            if not type(env).__module__.startswith(("sejax.", "gymnax.")):
-                _check_step(vectors, params, name)  # takes seconds; the others have tests
+            require_own_steps(self.env)
+            env = as_vectors(self.env, params)
+            observation, action = spaces_of(env, params)
+            sizes = [(type(x), x.size) for x in (observation, action)]
+            is_same = sizes == [(type(x), x.size) for x in spaces_of(env)]  # of its default_params
+            options.require(is_same, "env", "needs its own default_params", got=self.name)
+            if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
+                _check_step(env, params, self.name)  # takes seconds; the others have tests
         except options.ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
-            must = f"must be a gymnax 1.x environment; {name} raised {options.told(error)}."
-            raise options.ConfigError("env", must) from error
-        known = {"env": vectors, "params": params, "max_steps": max_steps}
-        known |= {"observation": observation, "action": action, "solved_reward": solved_reward}
-        vars(self).update(known)
+            rule = f"must be a gymnax 1.x environment; {self.name} raised {options.told(error)}."
+            raise options.ConfigError("env", rule) from error
+        values = {"env": env, "params": params, "max_steps": max_steps}
+        values |= {"observation": observation, "action": action, "solved_reward": solved_reward}
+        vars(self).update(values)
 
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
@@ -113,12 +113,12 @@ def require_own_steps(env: Environment) -> None:
       ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`, and for
         what has no `step_env`, such as a task.
     """
-    must = "must have reset_env and step_env, as gymnax's have"
+    rule = "must have reset_env and step_env, as gymnax's have"
     fix = "Derive a wrapper from sejax.envs.wrappers.Wrapper; of a task pass task.env."
     methods = dir(type(env))
     is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
     is_whole &= hasattr(env, "step_env")
-    options.require(is_whole, "env", must, got=type(env).__name__, fix=fix)
+    options.require(is_whole, "env", rule, got=type(env).__name__, fix=fix)
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:
@@ -134,21 +134,21 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
         env.is_truncated(next_state, params)
         in_space = jnp.zeros(env.observation_space(params).shape, obs.dtype)
-        wanted = {"obs": in_space, "next_obs": obs, "state": state}
-        wanted |= {"reward": jnp.float32(0), "terminated": jnp.bool_(False)}
-        got = {"obs": obs, "next_obs": next_obs, "state": next_state}
-        return wanted, got | {"reward": jnp.float32(reward), "terminated": terminated}
+        expected = {"obs": in_space, "next_obs": obs, "state": state}
+        expected |= {"reward": jnp.float32(0), "terminated": jnp.bool_(False)}
+        actual = {"obs": obs, "next_obs": next_obs, "state": next_state}
+        return expected, actual | {"reward": jnp.float32(reward), "terminated": terminated}
 
     def types(tree: PyTree) -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
-    wanted, got = map(types, jax.eval_shape(step, jax.random.key(0)))
-    keys = [x for x in wanted | got if wanted.get(x) != got.get(x)]
-    faults = [f"{x} is {got.get(x)}, not {wanted.get(x)}" for x in keys]
-    must = f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}"
-    options.require(not faults, "env", must, fix="Cast in reset_env and step_env what differs.")
+    expected, actual = map(types, jax.eval_shape(step, jax.random.key(0)))
+    keys = [x for x in expected | actual if expected.get(x) != actual.get(x)]
+    faults = [f"{x} is {actual.get(x)}, not {expected.get(x)}" for x in keys]
+    rule = f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}"
+    options.require(not faults, "env", rule, fix="Cast in reset_env and step_env what differs.")
     at_limit = getattr(type(env), "is_truncated", Environment.is_truncated)
     if at_limit.__module__.startswith(("sejax.", "gymnax.")):  # else the limit is the user's own
         times = jax.jit(lambda key: [x["state"].time for x in step(key)])(jax.random.key(0))

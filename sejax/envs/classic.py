@@ -100,7 +100,8 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
 _NONE = 3.4028234663852886e38  # how CartPole writes that a number has no bound
 _CARTPOLE = Box.symmetric(4.8, _NONE, math.radians(24), _NONE)
 _ACROBOT = Box.symmetric(1.0, 1.0, 1.0, 1.0, 4 * math.pi, 9 * math.pi)
-_PENDULUM, _TORQUE = Box.symmetric(1.0, 1.0, 8.0), Box.symmetric(2.0)
+_PENDULUM = Box.symmetric(1.0, 1.0, 8.0)
+_TORQUE = Box.symmetric(2.0)
 _CAR = Box(low=(-1.2, -0.07), high=(0.6, 0.07))  # position and velocity
 
 

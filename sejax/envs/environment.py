@@ -146,8 +146,8 @@ def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space,
         return env.spaces
     with jax.ensure_compile_time_eval():  # gymnax computes some spaces
         params = env.default_params if params is None else params
-        spaces = env.observation_space(params), env.action_space(params)
-        return _of_gymnax(spaces[0], "observations"), _of_gymnax(spaces[1], "actions")
+        observation = _of_gymnax(env.observation_space(params), "observations")
+        return observation, _of_gymnax(env.action_space(params), "actions")
 
 
 def _as_gymnax(space: Space) -> Any:
@@ -155,20 +155,20 @@ def _as_gymnax(space: Space) -> Any:
 
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
-    # gymnax's wrappers want numbers.
-    bounds = (bound[0] if space.size == 1 else bound for bound in (space.low, space.high))
-    low, high = (jnp.array(bound, jnp.float32) for bound in bounds)
+    shape = () if space.size == 1 else (space.size,)  # gymnax's wrappers want numbers
+    low = jnp.array(space.low, jnp.float32).reshape(shape)
+    high = jnp.array(space.high, jnp.float32).reshape(shape)
     return spaces.Box(low, high, (space.size,), jnp.float32)
 
 
-def _of_gymnax(space: Any, what: str) -> Space:
+def _of_gymnax(space: Any, elements: str) -> Space:
     from gymnax.environments import spaces
 
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n))
     if isinstance(space, spaces.Box):
-        bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
-        low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
-        return Box(low, high)
+        low = np.broadcast_to(np.float32(space.low), space.shape)
+        high = np.broadcast_to(np.float32(space.high), space.shape)
+        return Box(tuple(low.ravel().tolist()), tuple(high.ravel().tolist()))
     fix = "Make them one array in a sejax.envs.wrappers.Wrapper."
-    raise ConfigError("env", f"must have {what} in a Box or Discrete", got=repr(space), fix=fix)
+    raise ConfigError("env", f"must have {elements} in a Box or Discrete", got=repr(space), fix=fix)

@@ -79,7 +79,8 @@ class GridWorld(Environment[GridState, GridParams]):
         """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
         index = jnp.asarray(self.next_indices)[state.index, action]
         state = GridState(index=index, time=state.time + 1)
-        is_hole, is_goal = jnp.asarray(self.is_hole)[index], jnp.asarray(self.is_goal)[index]
+        is_hole = jnp.asarray(self.is_hole)[index]
+        is_goal = jnp.asarray(self.is_goal)[index]
         reward = jnp.where(is_hole, params.hole_reward, params.step_reward)
         reward = jnp.where(is_goal, params.goal_reward, reward)
         return self.after(state, reward, params)

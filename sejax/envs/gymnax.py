@@ -50,10 +50,11 @@ class GymnaxTask(Options):
         try:
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
-            must = f"must be one that gymnax makes; {gymnax_id} raised {options.told(error)}."
-            raise options.ConfigError("env", must) from error
+            rule = f"must be one that gymnax makes; {gymnax_id} raised {options.told(error)}."
+            raise options.ConfigError("env", rule) from error
         max_steps = self.max_steps or params.max_steps_in_episode
-        is_usual = max_steps == params.max_steps_in_episode
-        usual = SOLVED_REWARD.get(gymnax_id, math.inf) if is_usual else math.inf
-        solved = usual if self.solved_reward is None else self.solved_reward
-        return Task(name=self.name, env=env, solved_reward=solved, max_steps=max_steps)
+        solved_reward = self.solved_reward
+        if solved_reward is None:
+            is_usual = max_steps == params.max_steps_in_episode
+            solved_reward = SOLVED_REWARD.get(gymnax_id, math.inf) if is_usual else math.inf
+        return Task(name=self.name, env=env, solved_reward=solved_reward, max_steps=max_steps)

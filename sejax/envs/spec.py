@@ -136,10 +136,9 @@ def _plain(space: Space) -> dict[str, Any]:
     """A space of `TaskSpec.interface`, its bounds in single precision."""
     if isinstance(space, Discrete):
         return {"n": space.n}
-    bounds = {"low": space.low, "high": space.high}
     return {
         name: [float(np.float32(x)) if math.isfinite(x) else None for x in bound]
-        for name, bound in bounds.items()
+        for name, bound in vars(space).items()
     }
 
 
@@ -147,5 +146,6 @@ def _space_of(plain: Mapping[str, Any]) -> Space:
     """Inverse of `_plain`."""
     if "n" in plain:
         return Discrete(plain["n"])
-    bounds = (plain["low"], -math.inf), (plain["high"], math.inf)
-    return Box(*(tuple(end if x is None else float(x) for x in bound) for bound, end in bounds))
+    low = tuple(-math.inf if x is None else float(x) for x in plain["low"])
+    high = tuple(math.inf if x is None else float(x) for x in plain["high"])
+    return Box(low, high)

@@ -68,7 +68,8 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
     def step_env(
         self, key: Array, state: EnvState, action: Array, params: EnvParams
     ) -> Step[EnvState]:
-        total, num_steps = jnp.float32(0), jnp.int32(0)
+        total = jnp.float32(0)
+        num_steps = jnp.int32(0)
         ended = jnp.bool_(False)
         out: Any = None
         for step_key in jax.random.split(key, self.num_repeats):
@@ -200,8 +201,8 @@ def as_vectors(env: Environment, params: EnvParams) -> Environment:
     shape = (action.size,) if is_own else env.action_space(params).shape
     has_plain_obs = is_own or isinstance(observation, Discrete)
     if not has_plain_obs:  # a real observation tells; a space may be wrong (gymnax's FourRooms)
-        came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
-        has_plain_obs = came.ndim == 1 and came.dtype == jnp.float32
+        obs = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
+        has_plain_obs = obs.ndim == 1 and obs.dtype == jnp.float32
     if isinstance(action, Box):
         low, high = np.array(action.low), np.array(action.high)
         is_bounded = np.isfinite([low, high]).all() and (low < high).all()

@@ -73,8 +73,8 @@ class MujocoTask(Options):
             why = str(error)
             if isinstance(error, ImportError):
                 why = f"needs the extra; {error}. Type pip install '.[mujoco]'"
-            must = f"cannot be {self.name}, which {why}{self.otherwise}."
-            raise ConfigError("env", must) from error
+            rule = f"cannot be {self.name}, which {why}{self.otherwise}."
+            raise ConfigError("env", rule) from error
         return Task.of(self.spec, name=self.name, env=MujocoEnv(self))
 
     @property
@@ -90,7 +90,8 @@ class MujocoTask(Options):
         Noise is uniform in +-`reset_noise_scale`, or normal with that deviation.
         """
         key_qpos, key_qvel = jax.random.split(key)
-        model, scale = self.physics.model, self.reset_noise_scale
+        model = self.physics.model
+        scale = self.reset_noise_scale
         noise = jax.random.uniform(key_qpos, (model.nq,), minval=-scale, maxval=scale)
         qpos = noise + np.float32(model.qpos0)
         if self.normal_velocities:

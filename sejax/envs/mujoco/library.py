@@ -65,8 +65,8 @@ def _load() -> ctypes.CDLL:
 def file_name() -> str:
     """The library's name, another one for each version of anything that it is built from."""
     versions = f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}"
-    source, options = SOURCE.read_text(encoding="utf-8"), (*FLAGS, *compiler()[1:])
-    parts = (source, *options, versions, platform.system(), *platform.libc_ver())
+    source = SOURCE.read_text(encoding="utf-8")
+    parts = (source, *FLAGS, *compiler()[1:], versions, platform.system(), *platform.libc_ver())
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return f"{versions}-{digest}.so"
 
@@ -87,9 +87,9 @@ def build(path: Path) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = shortened(error if isinstance(error, OSError) else error.stderr.strip(), 120)
-        message = f"needs a C++ compiler; {command[0]} failed with: {said}. Mend that, or set CXX"
-        raise ConfigError("", message) from error
+        reason = shortened(error if isinstance(error, OSError) else error.stderr.strip(), 120)
+        rule = f"needs a C++ compiler; {command[0]} failed with: {reason}. Mend that, or set CXX"
+        raise ConfigError("", rule) from error
 
 
 def compiler() -> list[str]:

@@ -156,8 +156,8 @@ class Hopper(Runner):
         return (height > 0.7) & (jnp.abs(angle) < 0.2) & jnp.all(jnp.abs(others) < 100)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
-        survive = healthy * self.healthy_reward
-        return {**super().rewards(now, action, healthy), "reward_survive": survive}
+        reward_survive = healthy * self.healthy_reward
+        return {**super().rewards(now, action, healthy), "reward_survive": reward_survive}
 
     def more_info(self, now: "Report") -> Scalars:
         return {
@@ -263,12 +263,9 @@ class Ant(Runner):
 
     @property
     def spec(self) -> TaskSpec:
-        return _spec(
-            105 if self.include_cfrc_ext_in_observation else 27,
-            8,
-            solved_reward=6000.0,
-            info_keys=(*_INFO_IN_A_PLANE, "reward_contact", "reward_survive"),
-        )
+        obs_dim = 105 if self.include_cfrc_ext_in_observation else 27
+        info_keys = (*_INFO_IN_A_PLANE, "reward_contact", "reward_survive")
+        return _spec(obs_dim, 8, solved_reward=6000.0, info_keys=info_keys)
 
     def observe(self, now: "Report") -> Float[Array, " obs_dim"]:
         obs = super().observe(now)
@@ -277,8 +274,8 @@ class Ant(Runner):
         return jnp.concatenate([obs, _forces(now)[1:].ravel()])  # the first body is the world
 
     def is_healthy(self, now: "Report") -> Bool[Array, ""]:
-        finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
-        return finite & (now.qpos[2] >= 0.2) & (now.qpos[2] <= 1.0)
+        is_finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
+        return is_finite & (now.qpos[2] >= 0.2) & (now.qpos[2] <= 1.0)
 
     def rewards(self, now: "Report", action: Array, healthy: Array) -> Scalars:
         return {
