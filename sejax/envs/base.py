@@ -1,10 +1,9 @@
 """A task: a real environment that agents are tested on, and its spec."""
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import jax
@@ -78,7 +77,7 @@ class Task(TaskSpec):
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = options.checked(limit, options.Count, "env.max_steps", 200)
             if params.max_steps_in_episode != max_steps:
-                params = dataclasses.replace(params, max_steps_in_episode=max_steps)
+                params = replace(params, max_steps_in_episode=max_steps)
             require_own_steps(self.env)
             env = as_vectors(self.env, params)
             observation, action = spaces_of(env, params)

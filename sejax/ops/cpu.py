@@ -22,8 +22,7 @@ MIN_BLOCK = 32
 # Numbers of network sizes that varied agents choose from, for one hidden layer and for more. Units
 # that are switched off cost time: in proportion to the layer's size with one hidden layer, and to
 # its square with more.
-NUM_SIZES = 6
-NUM_SIZES_DEEP = 12
+NUM_SIZES, NUM_SIZES_DEEP = 6, 12
 
 
 def width_of(num_agents: int) -> int:

@@ -32,8 +32,7 @@ def require_writable(field: str, folder: Path) -> None:
     new_folders = missing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        tempfile.TemporaryFile(dir=folder).close()
         remove_empty(new_folders)
     except (OSError, ValueError) as error:
         raise ConfigError(field, "must be a writable folder", got=error, use="FOLDER") from error

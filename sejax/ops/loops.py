@@ -101,11 +101,9 @@ def _while_any_active(
         def block(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             return jax.lax.fori_loop(0, per_check, lambda _, carry: step(carry), carry)
 
-        def advance(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-            if depth == 0:  # no block: its steps after the loop's end would not be masked
-                return step(carry)
-            return jax.lax.platform_dependent(carry, cpu=step, default=block)
-
+        advance: Body = functools.partial(jax.lax.platform_dependent, cpu=step, default=block)
+        if depth == 0:  # no block: its steps after the loop's end would not be masked
+            advance = step
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), advance, (large, small))
 
     @loop.def_vmap

@@ -236,11 +236,9 @@ def narrow(params: dict[str, PyTree], hidden_size: Array) -> dict[str, PyTree]:
         kernel = params[f"Dense_{layer}"]["kernel"]
         bias = params[f"Dense_{layer}"]["bias"]
         if layer > 0:
-            kernel = kernel * in_use[None, :] * widen
-            bias = bias * widen
+            kernel, bias = kernel * in_use[None, :] * widen, bias * widen
         if layer < num_layers - 1:
-            kernel = kernel * in_use[:, None]
-            bias = bias * in_use
+            kernel, bias = kernel * in_use[:, None], bias * in_use
         narrowed[f"Dense_{layer}"] = {"kernel": kernel, "bias": bias}
     if "width" in params:
         narrowed["width"] = jnp.float32(hidden_size)
@@ -268,6 +266,5 @@ class DuelingMLP(nn.Module):
 
     def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "actions *batch"]:
         features = self.features(x)
-        value = self.value(features)  # [1, *batch]
-        advantage = self.advantage(features)
+        value, advantage = self.value(features), self.advantage(features)  # value: [1, *batch]
         return value + advantage - jnp.mean(advantage, axis=0, keepdims=True)

@@ -115,8 +115,8 @@ def spread_groups_over_devices(
     Returns:
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
-    for name, count in (("devices", num_devices), ("num_parallel", num_parallel)):
-        checked(count, Count, name, None)
+    checked(num_devices, Count, "devices", None)
+    checked(num_parallel, Count, "num_parallel", None)
     available = jax.device_count()
     is_fit = num_devices is None or num_devices <= available
     require(is_fit, "devices", f"must be at most {available}", got=num_devices, use="null")
@@ -133,10 +133,9 @@ def spread_groups_over_devices(
 
     def map_spread(groups: Sequence[tuple[PyTree, ...]]) -> list[PyTree]:
         dealt = [jax.tree.map(lambda x: _deal(x, mesh.size), args) for args in groups]
-        sizes = [_size(args) for args in groups]
         return [
-            jax.tree.map(functools.partial(_gather, num_devices=mesh.size, size=size), out)
-            for size, out in zip(sizes, mapped(dealt), strict=True)
+            jax.tree.map(functools.partial(_gather, num_devices=mesh.size, size=_size(args)), out)
+            for args, out in zip(groups, mapped(dealt), strict=True)
         ]
 
     return map_spread

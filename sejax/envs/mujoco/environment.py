@@ -29,6 +29,7 @@ class MujocoTask(Options):
 
     Attributes:
       name: the task's name.
+      spec: what is known of the task.
       file: the model's file, one of Gymnasium's.
       frame_skip: MuJoCo's steps in one step.
       num_hidden: how many positions, from the first on, are not observed.
@@ -41,6 +42,7 @@ class MujocoTask(Options):
 
     group: ClassVar[str] = "env"
     name: ClassVar[str]
+    spec: ClassVar[TaskSpec]
     file: ClassVar[str]
     frame_skip: ClassVar[int]
     num_hidden: ClassVar[int] = 1
@@ -49,11 +51,6 @@ class MujocoTask(Options):
     otherwise: ClassVar[str] = ""
     terminate_when_unhealthy = True
     reset_noise_scale = 0.1
-
-    @property
-    def spec(self) -> TaskSpec:
-        """What is known of the task."""
-        raise NotImplementedError
 
     def make(self) -> Task:
         """The task.

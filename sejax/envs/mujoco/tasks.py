@@ -7,12 +7,11 @@ a C++ compiler.
 Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, version 5 of each task.
 """
 
-import dataclasses
 import io
 import math
 import warnings
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import jax
@@ -219,7 +218,7 @@ class InvertedPendulum(MujocoTask):
     file = "inverted_pendulum.xml"
     frame_skip = 2
     num_hidden = 0
-    spec = dataclasses.replace(_spec(4, 1, solved_reward=950.0), action=Box.symmetric(3.0))
+    spec = replace(_spec(4, 1, solved_reward=950.0), action=Box.symmetric(3.0))
 
     reset_noise_scale: NonNegative = 0.01
 
@@ -262,7 +261,7 @@ class Ant(Runner):
     include_cfrc_ext_in_observation: bool = True
 
     @property
-    def spec(self) -> TaskSpec:
+    def spec(self) -> TaskSpec:  # type: ignore[override]
         obs_dim = 105 if self.include_cfrc_ext_in_observation else 27
         info_keys = (*_INFO_IN_A_PLANE, "reward_contact", "reward_survive")
         return _spec(obs_dim, 8, solved_reward=6000.0, info_keys=info_keys)
@@ -308,7 +307,7 @@ class Reacher(MujocoTask):
     name = "reacher"
     file = "reacher.xml"
     frame_skip = 2
-    spec = dataclasses.replace(
+    spec = replace(
         _spec(10, 2, solved_reward=-3.75, info_keys=("reward_dist", "reward_ctrl")), max_steps=50
     )
 
