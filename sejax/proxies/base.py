@@ -71,9 +71,10 @@ class ProxyConfig(Options, ABC):
 
     def _error(self, name: str, value: object, why: str) -> ConfigError:
         """Error for a field with one allowed value; in the message `why` follows that value."""
-        only, got = as_text(value), as_text(getattr(self, name))
-        must = f"must be {only} {shortened(why, 120)}"
-        return ConfigError(f"{self.group}.{name}", must, got=got, use=only)
+        allowed = as_text(value)
+        rule = f"must be {allowed} {shortened(why, 120)}"
+        got = as_text(getattr(self, name))
+        return ConfigError(f"{self.group}.{name}", rule, got=got, use=allowed)
 
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":
@@ -158,7 +159,8 @@ class ProxyEnv(Environment, ABC):
           learned_config: configuration that a stored proxy was learned with, nested plain values.
         """
         env = copy.copy(self)
-        env._default_params, env.learned_config = params, learned_config
+        env._default_params = params
+        env.learned_config = learned_config
         return env
 
     @property

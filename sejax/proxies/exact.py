@@ -66,13 +66,13 @@ def make_exact(
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
     require_vectors(task)
     is_fit = states.shape == (len(states), task.obs_dim) and np.isfinite(states).all()
-    must = f"must be two or more rows of {task.obs_dim} finite numbers"
-    require(is_fit and len(states) > 1, "states", must, got=states.shape)
+    rule = f"must be two or more rows of {task.obs_dim} finite numbers"
+    require(is_fit and len(states) > 1, "states", rule, got=states.shape)
     shapes = [kernel.shape for kernel, _ in layers]
     sizes = [task.obs_dim, *(len(bias) for _, bias in layers)]
     is_chain = layers and shapes == [*zip(sizes[1:], sizes[:-1], strict=True)]
-    must = f"must be layers from {task.obs_dim} numbers to {task.action_dim}; got {shapes}."
-    require(is_chain and sizes[-1] == task.action_dim, "policy", must)
+    rule = f"must be layers from {task.obs_dim} numbers to {task.action_dim}; got {shapes}."
+    require(is_chain and sizes[-1] == task.action_dim, "policy", rule)
     is_discrete = task.num_actions is not None
     reward = _preference(layers, states) if is_discrete else _as_network(layers, task.max_action)
     config = SyntheticConfig(
@@ -124,10 +124,12 @@ def _preference(layers: Sequence[Layer], states: np.ndarray) -> list[Layer]:
         (block_diag(np.eye(size), kernel), np.concatenate([np.zeros(size), bias]))
         for kernel, bias in layers
     )
-    action, output, shift = kernel[:size], kernel[size:] / margin, bias[size:] / margin
-    apart, shift = output[better] - output[chosen], shift[better] - shift[chosen]
+    output = kernel[size:] / margin
+    shift = bias[size:] / margin
+    difference = output[better] - output[chosen]
+    shift = shift[better] - shift[chosen]
     # relu(x) - relu(x - 1) is clip(x, 0, 1).
-    kernel = np.concatenate([action, apart, apart])
+    kernel = np.concatenate([kernel[:size], difference, difference])
     clipped = kernel, np.concatenate([bias[:size], shift, shift - 1])
     # relu(clip - 1 + a) is clip for the chosen action (a = 1), and 0 for others (a = 0).
     pairs = np.eye(len(better))
@@ -141,7 +143,7 @@ def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
     These are the mean and the covariance; with `independent` the covariances are 0. relu(n + c) - c
     is n, except for noise below -c.
     """
-    mean, size = states.mean(axis=0), states.shape[1]
+    size = states.shape[1]
     spread = np.cov(states, rowvar=False).reshape(size, size)
     if independent:
         spread = np.diag(np.diag(spread))
@@ -149,12 +151,13 @@ def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
     root = np.linalg.cholesky(spread + 1e-10 * np.eye(size) * max(1.0, np.abs(spread).max()))
     kernel = root - np.eye(size)
     shift = np.full(size, _MOST_NOISE)
-    return [(np.eye(size), shift), (kernel, mean - kernel @ shift)]
+    return [(np.eye(size), shift), (kernel, states.mean(axis=0) - kernel @ shift)]
 
 
 def _as_weights(layers: Sequence[Layer], hidden_size: int) -> dict[str, Any]:
     """Weights of a network with equally wide hidden layers; zeros fill up narrower layers."""
-    weights, width = {}, layers[0][0].shape[1]
+    weights = {}
+    width = layers[0][0].shape[1]
     for i, (kernel, bias) in enumerate(layers):
         missing = hidden_size - len(bias) if i < len(layers) - 1 else 0
         columns = (0, width - kernel.shape[1])

@@ -6,10 +6,9 @@ executes, resolves and imports nothing that the file names. `sejax.proxies.io` m
 for JAX from it, and `sejax.gym` makes environments for Gymnasium.
 """
 
-import dataclasses
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,8 +62,7 @@ class Header:
         explored = config.get("exploration", {"name": "none"})
         parts = [config["env"], config["proxy"], *config["agents"].values(), explored]
         are_named = all(isinstance(part.get("name"), str) for part in parts)
-        is_whole = self.proxies and all(isinstance(x, Mapping) for x in self.proxies) and are_named
-        if self.format_version != FORMAT_VERSION or not is_whole:
+        if self.format_version != FORMAT_VERSION or not (self.proxies and are_named):
             raise ValueError(f"format {self.format_version}, or a part that is missing")
         numbers = [self.discount]
         for record in self.proxies:
@@ -132,11 +130,12 @@ def configured(group: str, values: object, where: str) -> Any:
         require_typed({group: values})
         return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"
-    field, word = PLUGIN_ARGUMENTS.get(group, group), PLUGIN_WORDS.get(group, group)
-    must = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
+    argument = PLUGIN_ARGUMENTS.get(group, group)
+    word = PLUGIN_WORDS.get(group, group)
+    rule = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
     text = shortened(name, 80) if ":" in str(name) else "MODULE:NAME"
-    fix = f"If you trust it, set {word}={text} in a command, or {field}=... in Python."
-    raise ConfigError(field, must, got=shortened(name, 40), fix=fix)
+    fix = f"If you trust it, set {word}={text} in a command, or {argument}=... in Python."
+    raise ConfigError(argument, rule, got=shortened(name, 40), fix=fix)
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -167,8 +166,8 @@ def find(source: str | Path, option: str = "source") -> Path:
     if name in pretrained_names():
         return PRETRAINED_DIR / f"{name}.safetensors"
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
-        must = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
-        raise ConfigError(option, f"{must}; got {shortened(name)}, where there is none.")
+        rule = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
+        raise ConfigError(option, f"{rule}; got {shortened(name)}, where there is none.")
     raise unknown_name(option, name, pretrained_names())
 
 
@@ -196,15 +195,16 @@ def read(
         tensors, plain = checksummed.read(path, KIND)
         header = from_plain(Header, plain, "header")
     except (OSError, LookupError, AttributeError, ValueError, TypeError, ArithmeticError) as error:
-        must = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
-        raise ConfigError(option, must) from error
-    is_kind, got = not kinds or header.kind in kinds, f"{shortened(header.kind, 20)} in {where}"
-    require(is_kind, option, f"must have proxy={' or '.join(map(str, kinds))}", got=got)
+        rule = f"must be whole, as sejax wrote it; got {where} ({shortened(error, 60)})."
+        raise ConfigError(option, rule) from error
+    is_allowed = not kinds or header.kind in kinds
+    got = f"{shortened(header.kind, 20)} in {where}"
+    require(is_allowed, option, f"must have proxy={' or '.join(map(str, kinds))}", got=got)
     is_one = len(header.proxies) == 1 or not single
     require(is_one, option, f"must be a single proxy. sejax.load_set reads the set {where}.")
     if single and header.is_set:  # a set of one
         tensors = {name: x[0] if x.shape[:1] == (1,) else x for name, x in tensors.items()}
-        header = dataclasses.replace(header, is_set=False)
+        header = replace(header, is_set=False)
     return Stored(path, tensors, header)
 
 

@@ -41,9 +41,9 @@ def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:
       ('user/repo', 'v1', 'proxy.safetensors')
     """
     match = _ADDRESS.fullmatch(address) if len(address) < 500 else None
-    must = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
+    rule = "must be hf://USER/REPO[@REVISION][/FILE.safetensors]"
     if match is None:
-        raise ConfigError(option, must, got=repr(address))
+        raise ConfigError(option, rule, got=repr(address))
     repo, revision, file = match.groups()
     return repo, revision, file or FILE
 
@@ -79,6 +79,6 @@ def explained(option: str, address: str) -> Iterator[None]:
         raise
     except Exception as error:  # the HTTP library's too, which depends on huggingface_hub's version
         got = f"{shortened(address, 60)}: {shortened(told(error), 90)}"
-        must = f"must be within reach on the Hub; got {got}"
+        rule = f"must be within reach on the Hub; got {got}"
         fix = "Check the name and the network, or log in: hf auth login."
-        raise ConfigError(option, must, fix=fix) from error
+        raise ConfigError(option, rule, fix=fix) from error

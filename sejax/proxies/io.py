@@ -1,11 +1,10 @@
 """Proxies from and to files: `save`, `load`, and what is known of a stored proxy."""
 
-import dataclasses
 import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NoReturn, overload
 
@@ -17,9 +16,8 @@ from jaxtyping import PyTree
 from sejax import envs, options
 from sejax.agents import Agent, make_agent
 from sejax.agents.base import AgentConfig
-from sejax.envs.base import Task
+from sejax.envs import Task, TaskSpec
 from sejax.envs.environment import Environment
-from sejax.envs.spec import TaskSpec
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, require_known, shortened, told
@@ -77,8 +75,8 @@ class _Loaded:
           >>> list(load_proxy("cliff_walking-rn").learned_agents())
           ['q_learning']
         """
-        stored, where = self.config["agents"].items(), self.path.name
-        return {key: header.configured("agent", values, where) for key, values in stored}
+        agents = self.config["agents"]
+        return {x: header.configured("agent", agents[x], self.path.name) for x in agents}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,9 +140,9 @@ class ProxySet(_Loaded):
         weights = jax.tree.map(lambda leaf: leaf[numbers], self.weights)
         if numbers.ndim:
             records = tuple(self.records[number] for number in numbers)
-            return dataclasses.replace(self, weights=weights, records=records)
+            return replace(self, weights=weights, records=records)
         params = self.env.params(jax.tree.map(jax.numpy.asarray, weights), self.discount)
-        shared = {x.name: getattr(self, x.name) for x in dataclasses.fields(_Loaded)}
+        shared = {x.name: getattr(self, x.name) for x in fields(_Loaded)}
         shared["env"] = self.env.with_default_params(params, self.config)
         return Proxy(params=params, record=self.records[numbers], **shared)
 
@@ -223,19 +221,20 @@ def training_of(
     """
     env, config = _stored_env(proxy)
     stored: Any = config.get("training")
-    must = f"must be given for {shortened(env.name)}, whose file does not tell it; got none"
-    require(isinstance(stored, Mapping), "training", must, use="sejax.TrainingConfig(...)")
+    rule = f"must be given for {shortened(env.name)}, whose file does not tell it; got none"
+    require(isinstance(stored, Mapping), "training", rule, use="sejax.TrainingConfig(...)")
     training = from_plain(TrainingConfig, stored, "training")
-    agents, limits = config["agents"].values(), (env.max_steps, env.task.max_steps)
+    agents = config["agents"].values()
+    limits = (env.max_steps, env.task.max_steps)
     if agent is None or training.max_steps is None or to_plain(agent, "agent") in agents:
         return training
     registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
     registered = [x for x in agents if header.is_registered("agent", x)]
-    known = [header.configured("agent", x, env.name) for x in registered]
-    waited = max((x.steps_before_learning(*limits) for x in known), default=0)
-    longer = max(0, agent.steps_before_learning(*limits) - waited)
-    max_steps, max_episodes = training.max_steps + longer, training.max_episodes + longer
-    return dataclasses.replace(training, max_steps=max_steps, max_episodes=max_episodes)
+    learned = [header.configured("agent", x, env.name) for x in registered]
+    wait = max((x.steps_before_learning(*limits) for x in learned), default=0)
+    longer = max(0, agent.steps_before_learning(*limits) - wait)
+    max_episodes = training.max_episodes + longer
+    return replace(training, max_steps=training.max_steps + longer, max_episodes=max_episodes)
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -294,43 +293,41 @@ def save_set(
       ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    are_weights = weights and all(isinstance(x, Mapping) for x in weights)
-    require(are_weights, "weights", "must be as of init_weights. Set weights=params.weights.")
-    must = "must be given for a potential-based RN; got None. Set discount=params.discount."
-    require(discount is not None or not env.config.needs_discount, "discount", must)
+    rule = "must be given for a potential-based RN; got None. Set discount=params.discount."
+    require(discount is not None or not env.config.needs_discount, "discount", rule)
     gamma = 1.0 if discount is None else discount
     gamma = options.checked(gamma, options.Fraction, "discount", 1.0)
     try:
         stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *weights)
-    except (ValueError, TypeError) as error:
-        must = "must be numbers, of the same names and shapes for each proxy"
-        raise ConfigError("weights", must, got=told(error), use="params.weights") from error
-    tensors = flatten_dict(stacked, sep="/")
+        tensors = flatten_dict(stacked, sep="/")
+    except (ValueError, TypeError, AssertionError) as error:
+        rule = "must be numbers in the form of init_weights, the same for each proxy"
+        raise ConfigError("weights", rule, got=told(error), use="params.weights") from error
     _require_weights("weights", tensors, env, len(records), "params.weights")
     if not is_set:
         tensors = {name: x[0] for name, x in tensors.items()}
     # A name that is not registered, as the registered one may make another task.
     origin = env.task.origin or {"name": f"{env.task.name}, made by hand"}
     # `run_dir` would be a path of this machine.
-    known = {"proxy": to_plain(env.config, "proxy"), "env": origin, "run_dir": None}
+    parts = {"proxy": to_plain(env.config, "proxy"), "env": origin, "run_dir": None}
     try:
         config = dict(config or {})
         if "training" in config:  # whose fields may be left out
-            known["training"] = to_plain(from_plain(TrainingConfig, config["training"], "training"))
+            parts["training"] = to_plain(from_plain(TrainingConfig, config["training"], "training"))
         stored = Header(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            config={**config, **known},
+            config={**config, **parts},
             discount=gamma,
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
         data = checksummed.pack(tensors, header.KIND, vars(stored))
     except (LookupError, ValueError, TypeError, AttributeError) as error:
-        must = "must be plain values that sejax.load takes, with numbers for score and seed"
+        rule = "must be plain values that sejax.load takes, with numbers for score and seed"
         use = "sejax.config(...).plain()"
-        raise ConfigError("config", f"and record {must}", got=told(error), use=use) from error
+        raise ConfigError("config", f"and record {rule}", got=told(error), use=use) from error
     write_bytes(Path(path).expanduser(), data)
 
 
@@ -441,7 +438,8 @@ def load_set(
 
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
-    learned, where = stored.header, stored.path.name
+    learned = stored.header
+    where = stored.path.name
     proxy = proxy or header.configured("proxy", learned.config["proxy"], where)
     real = task
     if real is None:
@@ -450,15 +448,15 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
         except ConfigError as error:
             if proxy.needs_task:
                 raise
-            known = json.dumps([learned.interface, learned.config["env"]], sort_keys=True)
-            real = _absent_task(learned.task, known, str(error))
+            spec = json.dumps([learned.interface, learned.config["env"]], sort_keys=True)
+            real = _absent_task(learned.task, spec, str(error))
     got = f"{shortened(learned.task, 30)} in {where}"
     require(learned.task == real.name, option, f"must be of the task {real.name}", got=got)
     if task is not None:
         limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
-        wanted, got = (shortened(x, 90) for x in (learned.interface, task.interface))
-        must = f"must have spaces and step limit of {shortened(where, 40)}, {wanted}; got {got}."
-        require(learned.interface | limit == task.interface, "task", must)
+        spaces, got = (shortened(x, 90) for x in (learned.interface, task.interface))
+        rule = f"must have spaces and step limit of {shortened(where, 40)}, {spaces}; got {got}."
+        require(learned.interface | limit == task.interface, "task", rule)
     return registry.make("proxy", proxy, real)
 
 
@@ -483,15 +481,15 @@ class AbsentEnv(Environment):
 
 
 @functools.cache
-def _absent_task(name: str, known: str, reason: str) -> Task:
+def _absent_task(name: str, plain_spec: str, reason: str) -> Task:
     """A task that is known only from a proxy's file; built once.
 
     Args:
       name: of the task.
-      known: its interface and its configuration, as JSON.
+      plain_spec: its interface and its configuration, as JSON.
       reason: why the task itself cannot be made.
     """
-    interface, origin = json.loads(known)
+    interface, origin = json.loads(plain_spec)
     spec = TaskSpec.of_interface(interface)
     task = Task(name=name, env=AbsentEnv(spec, reason), max_steps=spec.max_steps)
     vars(task)["origin"] = origin

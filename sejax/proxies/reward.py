@@ -4,9 +4,8 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 `docs/reference.md` 5.
 """
 
-import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
@@ -200,9 +199,9 @@ class RewardEnv(ProxyEnv):
         if self.task.num_states is not None and not sees_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
-        known = {"discount": jnp.float32(1.0 if discount is None else discount)}
-        known["limit_is_terminal"] = jnp.bool_(limit_is_terminal)
-        return dataclasses.replace(params, potentials=potentials, **known)
+        values = {"discount": jnp.float32(1.0 if discount is None else discount)}
+        values["limit_is_terminal"] = jnp.bool_(limit_is_terminal)
+        return replace(params, potentials=potentials, **values)
 
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()

@@ -121,11 +121,9 @@ class SyntheticConfig(ProxyConfig):
           >>> SyntheticConfig(hidden_size=8).networks(obs_dim=4, action_dim=2)
           {'reward': [6, 8, 1], 'start': [4, 32, 4]}
         """
-        outputs = {"state": obs_dim, "reward": 1, "done": 1}
-        if self.is_bandit:
-            outputs = {"reward": 1}
+        outputs = {"reward": 1} if self.is_bandit else {"state": obs_dim, "reward": 1, "done": 1}
         hidden = [self.hidden_size] * self.num_layers
-        networks = {head: [action_dim + obs_dim, *hidden, size] for head, size in outputs.items()}
+        networks = {name: [action_dim + obs_dim, *hidden, size] for name, size in outputs.items()}
         if self.reward_form != "network":
             networks["reward"] = [obs_dim, *hidden, action_dim]
         if self.initial_state == "learned":
@@ -147,7 +145,8 @@ class SyntheticConfig(ProxyConfig):
         low, high = (np.asarray(x, np.float32) for x in (space.low, space.high))
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
-        middle, one = (low + high) / 2, np.where(low < high, high - low, 4) / 4
+        middle = (low + high) / 2
+        one = np.where(low < high, high - low, 4) / 4
         return Units(middle.astype(np.float32), one.astype(np.float32))
 
     def make(self, task: Task) -> "SyntheticEnv":
@@ -157,7 +156,8 @@ class SyntheticConfig(ProxyConfig):
           ConfigError: if the form of the reward does not fit the task's actions.
         """
         self.require_task(task, task.name)
-        return (BanditEnv if self.is_bandit else SyntheticEnv)(task, self)
+        env_class = BanditEnv if self.is_bandit else SyntheticEnv
+        return env_class(task, self)
 
 
 @struct.dataclass
@@ -214,8 +214,8 @@ class SyntheticEnv(ProxyEnv):
         }
 
     def _net(self, name: str) -> MLP:
-        _, size, *_, num_outputs = units = self._networks[name]
-        return MLP(num_outputs, size, len(units) - 2, self.config.activation)
+        _, *hidden, num_outputs = self._networks[name]
+        return MLP(num_outputs, hidden[0], len(hidden), self.config.activation)
 
     def _apply(self, weights: PyTree, name: str, inputs: Array) -> Any:
         return self._net(name).apply({"params": weights[name]}, inputs)
@@ -225,9 +225,8 @@ class SyntheticEnv(ProxyEnv):
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The networks' raw outputs: next state, reward and done output d."""
         inputs = self._inputs(vector, action)
-        state, reward, done = (
-            self._apply(weights, name, inputs) for name in ("state", "reward", "done")
-        )
+        outputs = [self._apply(weights, name, inputs) for name in ("state", "reward", "done")]
+        state, reward, done = outputs
         return state if self._units is None else self._units.decode(state), reward[0], done[0]
 
     def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
@@ -312,5 +311,5 @@ class BanditEnv(SyntheticEnv):
             reward = self._apply(weights, "reward", self._inputs(vector, action))
             return vector, reward[0], jnp.float32(1)
         best = self._apply(weights, "reward", self._seen(vector))
-        apart = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
-        return vector, -jnp.abs(apart).sum(), jnp.float32(1)
+        difference = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
+        return vector, -jnp.abs(difference).sum(), jnp.float32(1)

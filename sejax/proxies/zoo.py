@@ -132,7 +132,8 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
       ConfigError: for an evaluation or a learning of another shape.
     """
     path, _, learned = stored
-    record, config = learned.proxies[0], learned.config
+    record = learned.proxies[0]
+    config = learned.config
     values = {x: record[x] for x in defaults_of(PretrainedProxy) if record.get(x) is not None}
     if "score" in record:
         values.setdefault("scores", dict.fromkeys(config["agents"], float(record["score"])))
@@ -224,9 +225,9 @@ def push(
     Raises:
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
-    stored, address = header.read(source, single=True), f"{hub.SCHEME}{repo}"
-    is_repo = hub.parse(address, "repo")[0] == repo
-    require(is_repo, "repo", "must be USER/REPO on the Hub", got=repo)
+    stored = header.read(source, single=True)
+    address = f"{hub.SCHEME}{repo}"
+    require(hub.parse(address, "repo")[0] == repo, "repo", "must be USER/REPO on the Hub", got=repo)
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, license)
     with hub.explained("repo", repo):
         from huggingface_hub import CommitOperationAdd, HfApi
