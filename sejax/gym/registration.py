@@ -144,9 +144,9 @@ def _read(source: Source, task: RealTask | str | None) -> tuple[Header, Syntheti
     """
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
     kinds: Any = str | None if header.kind == "rn" else RealTask | str | None
-    must = "must be an id of Gymnasium, or a RealTask for an SE"
+    rule = "must be an id of Gymnasium, or a RealTask for an SE"
     fix = "Set task=ID; RewardNetwork(env, source) wraps an environment."
-    require(isinstance(task, kinds), "task", must, got=task, fix=fix)
+    require(isinstance(task, kinds), "task", rule, got=task, fix=fix)
     if header.kind == "rn":
         return header, None
     config = configure("proxy", header.config["proxy"])

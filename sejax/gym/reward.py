@@ -5,7 +5,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import ObservationWrapper
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.spaces import Discrete, flatdim, flatten
 from gymnasium.utils import RecordConstructorArgs
@@ -64,10 +63,11 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.config: RewardConfig = configure("proxy", header.config["proxy"])
         discount = header.discount if discount is None else discount
         self.discount = checked(discount, Fraction, "discount", header.discount)
-        weighs_info, keys = self.config.shaping.weighs_info, tuple[str, ...]()
+        weighs_info = self.config.shaping.weighs_info
+        keys: tuple[str, ...] = ()
         if weighs_info or self.config.augmented:  # the task's configuration has the keys
-            must = "must be of a task with a registered name, which says what info the RN reads"
-            require(is_registered("env", header.config["env"]), "source", must, got=header.task)
+            rule = "must be of a task with a registered name, which says what info the RN reads"
+            require(is_registered("env", header.config["env"]), "source", rule, got=header.task)
             spec = envs.spec_of(configured("env", header.config["env"], "source"))
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
@@ -100,15 +100,15 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
           KeyError: if `info` lacks an entry that the RN weighs or sees.
         """
         obs, real_reward, terminated, truncated, info = self.env.step(action)
-        real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
+        real_reward = float(real_reward)
         info_values = np.array([info[key] for key in self._info_keys], np.float32)
-        reward = bonus = self._bonus(obs, info_values, terminated)
-        if self.config.shaping.is_additive:
-            reward += real_reward
+        bonus = self._bonus(obs, info_values, bool(terminated))
+        reward = real_reward + bonus if self.config.shaping.is_additive else bonus
         if not (np.isfinite(reward) and abs(bonus) < MAX_ABS_VALUE):
-            reward, terminated = 0.0, True
+            reward = 0.0
+            terminated = True
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
-        return obs, reward, terminated, truncated, info
+        return obs, reward, bool(terminated), bool(truncated), info
 
     def potential(self, obs: np.ndarray, info_values: np.ndarray | tuple[()] = ()) -> float:
         """Phi of an observation and of the numbers of `info` that the network sees."""
@@ -129,7 +129,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         """The learned part of a transition's reward."""
         if self._weights is not None:
             return float(self._weights @ info_values)
-        before, self._potential = self._potential, self.potential(obs, info_values)
+        before = self._potential
+        self._potential = self.potential(obs, info_values)
         after = 0.0 if terminated and self.config.zero_at_terminal else self._potential
         return self.discount * after - before if self.config.shaping.is_potential_based else after
 
@@ -140,13 +141,13 @@ def _require_task(env: Env, header: Header) -> None:
     while isinstance(layers[-1], gymnasium.Wrapper):
         layers.append(layers[-1].env)
     learned = RealTask.of_spec(header.spec)
-    seen = [layer for layer in layers if isinstance(layer, ObservationWrapper)]
-    must = f"must be sejax's {shortened(header.task, 40)}, its numbers unchanged by wrappers"
+    observers = [layer for layer in layers if isinstance(layer, gymnasium.ObservationWrapper)]
+    rule = f"must be sejax's {shortened(header.task, 40)}, its numbers unchanged by wrappers"
     is_same = (
         not isinstance(layers[-1], CliffWalkingEnv)  # Gymnasium's, which has other rules
         and signature(env.observation_space) == signature(learned.observation_space)
         and signature(env.unwrapped.action_space) == signature(learned.action_space)
-        and all(isinstance(layer, SAME_NUMBERS) for layer in seen)
+        and all(isinstance(layer, SAME_NUMBERS) for layer in observers)
         and not any(isinstance(x, gymnasium.RewardWrapper | NormalizeReward) for x in layers)
     )
-    require(is_same, "env", must, got=env)
+    require(is_same, "env", rule, got=env)

@@ -38,7 +38,8 @@ class SyntheticVecEnv(DummyVecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:  # type: ignore[override]
         """Observations, rewards and ends, `[num_envs, ...]`, and an info for each environment."""
         rewards, terminated, truncated, discounts = self._episodes.advance(self.actions)
-        dones, cut = terminated | truncated, truncated & ~terminated
+        dones = terminated | truncated
+        cut = truncated & ~terminated
         infos: list[Info] = [
             {"discount": discount, "TimeLimit.truncated": is_cut}
             for discount, is_cut in zip(discounts.tolist(), cut.tolist(), strict=True)

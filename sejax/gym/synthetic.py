@@ -7,8 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.error import InvalidAction, ResetNeeded
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
@@ -54,19 +52,20 @@ class SyntheticWorld:
         self.max_steps = config.max_steps(task.max_steps)
         self.draws_ends = config.done == "bernoulli" and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
-        self.observation_space, self._units = task.observation_space, None
-        self.obs_dim, action_dim = map(spaces.flatdim, (task.observation_space, task.action_space))
-        if isinstance(task.observation_space, spaces.Box):
-            bounds = task.observation_space.low, task.observation_space.high
-            self._units = config.units(Box(*map(tuple, bounds)))
+        self.observation_space = space = task.observation_space
+        self.obs_dim = spaces.flatdim(space)
+        action_dim = spaces.flatdim(task.action_space)
+        self._units = None
+        if isinstance(space, spaces.Box):
+            self._units = config.units(Box(tuple(space.low), tuple(space.high)))
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
         units = config.networks(self.obs_dim, action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
         self._start_layers = networks.network_layers(weights, "start")
         heads = [networks.network_layers(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
-        must = "must draw initial states; got None. Set RealTask(starts=...)."
-        require(self.draws_noise or task.starts, "task.starts", must)
+        rule = "must draw initial states; got None. Set RealTask(starts=...)."
+        require(self.draws_noise or task.starts, "task.starts", rule)
         self._starts: Any = task.starts  # not None where it is called
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 
@@ -106,7 +105,7 @@ class SyntheticWorld:
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
-        raise InvalidAction(f"{action!r} is none of {space}")
+        raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
 
     def step(
         self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None
@@ -138,7 +137,8 @@ class SyntheticWorld:
         discount = 1 - (done * may_end if self.config.done == "soft" else terminated)
         truncated = at_limit
         if self.config.horizon is not None:
-            terminated, truncated = terminated | at_limit, at_limit & False
+            terminated = terminated | at_limit
+            truncated = at_limit & False
             discount = discount * (1 - at_limit)
         return outputs[..., :-2], reward, terminated, truncated, discount
 
@@ -152,16 +152,15 @@ class SyntheticWorld:
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d; in a bandit the state stays, and d is 1."""
         seen = vector if self._units is None else self._units.encode(vector)
-        known = self.config.reward_form != "network"
-        inputs = seen if known else np.concatenate([action, seen], axis=-1)
+        is_distance = self.config.reward_form != "network"
+        inputs = seen if is_distance else np.concatenate([action, seen], axis=-1)
         outputs = networks.forward(self._layers, self.config.activation, inputs)
-        if known:
+        if is_distance:
             bound = self.action_space.high  # type: ignore[attr-defined]
             outputs = -np.abs(action - bound * np.clip(outputs, -1, 1)).sum(-1, keepdims=True)
         if self.config.is_bandit:
-            whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
-            whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1
-            return whole
+            done = np.ones_like(outputs)
+            return np.concatenate([vector, outputs, done], axis=-1, dtype=np.float32)
         if self._units is not None:
             outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
@@ -209,15 +208,15 @@ class SyntheticGymEnv(gymnasium.Env[Any, Any]):
             Continuous actions are clipped to its bounds, as in Gymnasium's own environments.
         """
         if self._vector is None:
-            raise ResetNeeded("call reset() first: no episode is running")
+            raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(action, self.action_space)
         self._time += 1
         chance = self.np_random.random() if self.world.draws_ends else None
-        vector, reward, *ends, discount = self.world.step(self._vector, encoded, self._time, chance)
-        terminated, truncated = map(bool, ends)
+        outcome = self.world.step(self._vector, encoded, self._time, chance)
+        vector, reward, terminated, truncated, discount = outcome
         self._vector = None if terminated or truncated else vector
         info = {"discount": float(discount)}
-        return self.world.observe(vector), float(reward), terminated, truncated, info
+        return self.world.observe(vector), float(reward), bool(terminated), bool(truncated), info
 
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
@@ -272,12 +271,12 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         if not isinstance(seed, Sequence):
             seed = [None if seed is None else seed + i for i in range(self.num_envs)]
         require(len(seed) == self.num_envs, "seed", f"must be one, or {self.num_envs} of them.")
-        known = self._generators
-        is_new = np.array([number is not None or not known for number in seed])
-        self._num_used[is_new] = self._drawn.shape[1]  # starts drawn before are void
-        self._generators = [
-            seeding.np_random(seed[i])[0] if new else known[i] for i, new in enumerate(is_new)
-        ]
+        generators: list[Any] = self._generators.copy() or [None] * self.num_envs
+        for i, number in enumerate(seed):
+            if number is not None or generators[i] is None:
+                generators[i], _ = gymnasium.utils.seeding.np_random(number)
+                self._num_used[i] = self._drawn.shape[1]  # starts drawn before are void
+        self._generators = generators
         self._ended = np.zeros(self.num_envs, np.bool_)
         self.begin(~self._ended)
         return self.observe(), {}
@@ -299,7 +298,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             self._ended = ended
         elif ended.any():
-            obs, final_obs = self.observe(), np.full(self.num_envs, None)
+            obs = self.observe()
+            final_obs = np.full(self.num_envs, None)
             for i in np.flatnonzero(ended):
                 final_obs[i] = obs[i]
             infos = {"final_obs": final_obs, "final_info": _infos(discounts, ended)}
@@ -321,7 +321,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
           gymnasium.error.ResetNeeded, gymnasium.error.InvalidAction: as `step`.
         """
         if not self._generators:
-            raise ResetNeeded("call reset() first: no episode is running")
+            raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
         on = ~self._ended
         rewards, discounts = np.zeros((2, self.num_envs))

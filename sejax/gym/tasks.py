@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.wrappers import TimeLimit
 
 from sejax import envs
 from sejax.envs.spec import Discrete, Space, TaskSpec
@@ -93,20 +92,22 @@ def real_env(header: Header, **options: Any) -> Env:
       ConfigError: if neither has it, or for an option that the task does not have here.
       gymnasium.error.Error: if Gymnasium cannot make it.
     """
-    config, limit = header.config["env"], header.spec.max_steps
+    config = header.config["env"]
+    limit = header.spec.max_steps
     name = str(config.get("name"))
     is_known = name in GYMNASIUM_IDS or name in GRIDS
     # Gymnasium takes more options, such as the path of a model. A file may set only the fields that
     # the task has here.
     fields = to_plain(configure("env", config)) if is_known else {}
     is_known &= fields.pop("backend", "mujoco") != "spring"  # it has other dynamics
-    must = "must be given, because Gymnasium does not have the same task"
+    rule = "must be given, because Gymnasium does not have the same task"
     use = "ID of Gymnasium, or RealTask(...) for an SE, or RewardNetwork(env, source)"
-    require(is_known, "task", must, got=config, use=use)
+    require(is_known, "task", rule, got=config, use=use)
     if name in GRIDS:
-        mode, must = options.get("render_mode"), "must be None, as grid worlds have no picture"
-        require(mode is None, "render_mode", must, got=mode, fix="Leave it out.")
-        return TimeLimit(GridWorld(name, **fields), limit)
+        mode = options.get("render_mode")
+        rule = "must be None, as grid worlds have no picture"
+        require(mode is None, "render_mode", rule, got=mode, fix="Leave it out.")
+        return gymnasium.wrappers.TimeLimit(GridWorld(name, **fields), limit)
     return gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 
 
@@ -133,13 +134,14 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
         task = RealTask.of_env(env)
     has_limit = config.max_steps(task.max_steps) == config.max_steps(limit)
     require(has_limit, "task", f"must have max_steps={limit}", got=task.max_steps)
-    got, actions = task.action_space, learned.action_space
+    is_same = task.action_space == learned.action_space
+    rule = f"must have actions of {learned.action_space}"
     fix = "Wrap it in RescaleAction."
-    require(got == actions, "task", f"must have actions of {actions}", got=got, fix=fix)
-    seen, known = task.observation_space, learned.observation_space
-    is_seen, must = signature(seen) == signature(known), f"must observe {shortened(known)}"
-    require(is_seen, "task", must, got=seen)
-    return replace(task, observation_space=known)
+    require(is_same, "task", rule, got=task.action_space, fix=fix)
+    is_same = signature(task.observation_space) == signature(learned.observation_space)
+    rule = f"must observe {shortened(learned.observation_space)}"
+    require(is_same, "task", rule, got=task.observation_space)
+    return replace(task, observation_space=learned.observation_space)
 
 
 # --- grid worlds ----------------------------------------------------------------------------------
@@ -194,12 +196,14 @@ class GridWorld(gymnasium.Env[int, int]):
             raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"{action!r} is none of {self.action_space}")
-        obs, params = int(self._world.next_indices[self._index, action]), self._params
-        is_goal, is_hole = bool(self._world.is_goal[obs]), bool(self._world.is_hole[obs])
-        at_end = params.goal_reward if is_goal else params.hole_reward
-        terminated = is_goal or is_hole
+        obs = int(self._world.next_indices[self._index, action])
+        is_goal = self._world.is_goal[obs]
+        terminated = bool(is_goal or self._world.is_hole[obs])
+        reward = self._params.step_reward
+        if terminated:
+            reward = self._params.goal_reward if is_goal else self._params.hole_reward
         self._index = None if terminated else obs
-        return obs, at_end if terminated else params.step_reward, terminated, False, {}
+        return obs, reward, terminated, False, {}
 
 
 # --- spaces ---------------------------------------------------------------------------------------
