@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from sejax import options
 from sejax.envs.environment import Environment, EnvParams, spaces_of
 from sejax.envs.spec import Space, TaskSpec
 from sejax.envs.wrappers import as_vectors
+from sejax.options import ConfigError, Count, as_python, checked, require, shortened, told
 
 
 class TaskConfig(Protocol):
@@ -67,15 +67,14 @@ class Task(TaskSpec):
     action: Space = field(init=False)
 
     def __post_init__(self) -> None:
-        solved_reward = options.as_python(self.solved_reward)
+        solved_reward = as_python(self.solved_reward)
         is_nan = type(solved_reward) in (int, float) and math.isnan(solved_reward)
         is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
-        rule = "must be a number"
-        options.require(is_known, "env.solved_reward", rule, got=solved_reward, use="inf")
+        require(is_known, "env.solved_reward", "must be a number", got=solved_reward, use="inf")
         try:
             params = self.env.default_params if self.params is None else self.params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
-            max_steps = options.checked(limit, options.Count, "env.max_steps", 200)
+            max_steps = checked(limit, Count, "env.max_steps", 200)
             if params.max_steps_in_episode != max_steps:
                 params = replace(params, max_steps_in_episode=max_steps)
             require_own_steps(self.env)
@@ -83,14 +82,14 @@ class Task(TaskSpec):
             observation, action = spaces_of(env, params)
             sizes = [(type(x), x.size) for x in (observation, action)]
             is_same = sizes == [(type(x), x.size) for x in spaces_of(env)]  # of its default_params
-            options.require(is_same, "env", "needs its own default_params", got=self.name)
+            require(is_same, "env", "needs its own default_params", got=self.name)
             if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(env, params, self.name)  # takes seconds; the others have tests
-        except options.ConfigError:
+        except ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
-            rule = f"must be a gymnax 1.x environment; {self.name} raised {options.told(error)}."
-            raise options.ConfigError("env", rule) from error
+            rule = f"must be a gymnax 1.x environment; {self.name} raised {told(error)}."
+            raise ConfigError("env", rule) from error
         values = {"env": env, "params": params, "max_steps": max_steps}
         values |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(values)
@@ -117,7 +116,7 @@ def require_own_steps(env: Environment) -> None:
     methods = dir(type(env))
     is_whole = all(f"{name}_env" in methods for name in ("reset", "step") if name in methods)
     is_whole &= hasattr(env, "step_env")
-    options.require(is_whole, "env", rule, got=type(env).__name__, fix=fix)
+    require(is_whole, "env", rule, got=type(env).__name__, fix=fix)
 
 
 def _check_step(env: Environment, params: EnvParams, name: str) -> None:
@@ -146,10 +145,10 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
     expected, actual = map(types, jax.eval_shape(step, jax.random.key(0)))
     keys = [x for x in expected | actual if expected.get(x) != actual.get(x)]
     faults = [f"{x} is {actual.get(x)}, not {expected.get(x)}" for x in keys]
-    rule = f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}"
-    options.require(not faults, "env", rule, fix="Cast in reset_env and step_env what differs.")
+    rule = f"must keep its shapes; got {name}, where {shortened('; '.join(faults), 120)}"
+    require(not faults, "env", rule, fix="Cast in reset_env and step_env what differs.")
     at_limit = getattr(type(env), "is_truncated", Environment.is_truncated)
     if at_limit.__module__.startswith(("sejax.", "gymnax.")):  # else the limit is the user's own
         times = jax.jit(lambda key: [x["state"].time for x in step(key)])(jax.random.key(0))
         is_counted = isinstance(times[0], jax.core.Tracer) or times[0] != times[1]
-        options.require(is_counted, "env", "must add 1 to state.time in step_env", got=name)
+        require(is_counted, "env", "must add 1 to state.time in step_env", got=name)

@@ -42,8 +42,8 @@ def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
 def network_layers(weights: Mapping[str, np.ndarray], network: str) -> Layers:
     """A network's layers, empty if the network is missing; files hold kernels as `[out, in]`."""
     names = (f"{network}/Dense_{i}" for i in itertools.count())
-    there = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)
-    return [(weights[f"{name}/kernel"].T, weights[f"{name}/bias"]) for name in there]
+    present = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)
+    return [(weights[f"{name}/kernel"].T, weights[f"{name}/bias"]) for name in present]
 
 
 def joined(networks: Sequence[Layers]) -> Layers:

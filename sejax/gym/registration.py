@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax.gym.reward import RewardNetwork
@@ -126,7 +125,7 @@ def register() -> list[str]:
     """
     for name in pretrained_names():
         # With `max_episode_steps` Gymnasium would add a second time limit.
-        spec = EnvSpec(
+        spec = gymnasium.envs.registration.EnvSpec(
             f"sejax/{name}",
             "sejax.gym:make",
             vector_entry_point="sejax.gym:make_vec",
@@ -143,10 +142,10 @@ def _read(source: Source, task: RealTask | str | None) -> tuple[Header, Syntheti
       ConfigError: as `make`.
     """
     _, weights, header = read(source, kinds=("se", "rn"), single=True)
-    kinds: Any = str | None if header.kind == "rn" else RealTask | str | None
+    allowed: Any = str | None if header.kind == "rn" else RealTask | str | None
     rule = "must be an id of Gymnasium, or a RealTask for an SE"
     fix = "Set task=ID; RewardNetwork(env, source) wraps an environment."
-    require(isinstance(task, kinds), "task", rule, got=task, fix=fix)
+    require(isinstance(task, allowed), "task", rule, got=task, fix=fix)
     if header.kind == "rn":
         return header, None
     config = configure("proxy", header.config["proxy"])

@@ -5,10 +5,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces, utils, wrappers
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
-from gymnasium.spaces import Discrete, flatdim, flatten
-from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import DtypeObservation, FlattenObservation, NormalizeReward
 from numpy.typing import ArrayLike
 
 from sejax import envs
@@ -20,11 +18,13 @@ from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, is_registered, read
 from sejax.proxies.reward import RewardConfig
 
-SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
+# Wrappers of observations that change no number, and all wrappers that change rewards.
+SAME_NUMBERS = (wrappers.DtypeObservation, wrappers.FlattenObservation)
+OTHER_REWARDS = (gymnasium.RewardWrapper, wrappers.NormalizeReward)
 GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` with another name there
 
 
-class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], utils.RecordConstructorArgs):
     r"""An environment whose reward an RN makes; see `sejax.proxies.reward.RewardEnv`.
 
     Dynamics, spaces, starts and ends are the environment's own. Let r be the environment's reward
@@ -57,7 +57,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     """
 
     def __init__(self, env: Env, source: str | Path, discount: float | None = None):
-        RecordConstructorArgs.__init__(self, source=str(source), discount=discount)
+        utils.RecordConstructorArgs.__init__(self, source=str(source), discount=discount)
         super().__init__(env)
         _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = configure("proxy", header.config["proxy"])
@@ -72,7 +72,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
         _require_task(env, header)
-        num_inputs = flatdim(env.observation_space)
+        num_inputs = spaces.flatdim(env.observation_space)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
         shapes = networks.shapes_of({"potential": [num_inputs + num_keys, *hidden, 1]})
@@ -82,7 +82,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.network_layers(weights, "potential")
         self._table: list[float] | None = None  # [num_states]: potentials of discrete states
-        if isinstance(env.observation_space, Discrete) and self._layers and not keys:
+        if isinstance(env.observation_space, spaces.Discrete) and self._layers and not keys:
             self._table = self._apply(np.eye(num_inputs)).tolist()
         self._potential = 0.0  # of the agent's state
 
@@ -117,7 +117,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if not self._layers:
             return 0.0
         if len(info_values):
-            obs = np.concatenate([flatten(self.env.observation_space, obs), info_values])
+            obs = np.concatenate([spaces.flatten(self.env.observation_space, obs), info_values])
         return float(self._apply(obs))
 
     def _apply(self, inputs: np.ndarray) -> np.ndarray:
@@ -148,6 +148,6 @@ def _require_task(env: Env, header: Header) -> None:
         and signature(env.observation_space) == signature(learned.observation_space)
         and signature(env.unwrapped.action_space) == signature(learned.action_space)
         and all(isinstance(layer, SAME_NUMBERS) for layer in observers)
-        and not any(isinstance(x, gymnasium.RewardWrapper | NormalizeReward) for x in layers)
+        and not any(isinstance(layer, OTHER_REWARDS) for layer in layers)
     )
     require(is_same, "env", rule, got=env)

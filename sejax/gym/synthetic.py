@@ -133,7 +133,8 @@ class SyntheticWorld:
             reward, done = reward.item(), done.item()
         at_limit = time >= self.max_steps
         may_end = (time >= self.config.min_steps) | absurd
-        terminated = (chance < done if self.draws_ends else done > 0.5) & may_end | absurd
+        ends = chance < done if self.draws_ends else done > 0.5
+        terminated = ends & may_end | absurd
         discount = 1 - (done * may_end if self.config.done == "soft" else terminated)
         truncated = at_limit
         if self.config.horizon is not None:

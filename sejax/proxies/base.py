@@ -71,10 +71,9 @@ class ProxyConfig(Options, ABC):
 
     def _error(self, name: str, value: object, why: str) -> ConfigError:
         """Error for a field with one allowed value; in the message `why` follows that value."""
-        allowed = as_text(value)
-        rule = f"must be {allowed} {shortened(why, 120)}"
-        got = as_text(getattr(self, name))
-        return ConfigError(f"{self.group}.{name}", rule, got=got, use=allowed)
+        only = as_text(value)
+        rule = f"must be {only} {shortened(why, 120)}"
+        return ConfigError(f"{self.group}.{name}", rule, got=as_text(getattr(self, name)), use=only)
 
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":

@@ -68,7 +68,7 @@ class Header:
         for record in self.proxies:
             numbers += [record[name] for name in ("score", "generation", "seed") if name in record]
             numbers += dict(record.get("scores", {})).values()
-        are_numbers = {*map(type, numbers)} <= {int, float} and 0 <= self.discount <= 1
+        are_numbers = all(type(x) in (int, float) for x in numbers) and 0 <= self.discount <= 1
         np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
         sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
@@ -107,7 +107,8 @@ def _sizes_of(space: Space) -> list[int]:
     """The counts in a space; 0 if a lower bound exceeds the upper one."""
     if not isinstance(space, Box):
         return [space.n]
-    return [space.size * all(low <= high for low, high in zip(space.low, space.high, strict=True))]
+    is_ordered = all(low <= high for low, high in zip(space.low, space.high, strict=True))
+    return [space.size if is_ordered else 0]
 
 
 def is_registered(group: str, stored: object) -> bool:

@@ -160,7 +160,8 @@ class ProxySet(_Loaded):
         """The `count` best proxies, best first, or the worst; proxies without a score come last."""
         scores = np.nan_to_num(self.scores, nan=np.inf if worst else -np.inf)
         order = np.argsort(scores, kind="stable")
-        return self[(order if worst else order[::-1])[:count]]
+        order = order if worst else order[::-1]
+        return self[order[:count]]
 
 
 def _stored_env(proxy: ProxyEnv | Proxy | ProxySet) -> tuple[ProxyEnv, Mapping[str, Any]]:
@@ -454,7 +455,8 @@ def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option
     require(learned.task == real.name, option, f"must be of the task {real.name}", got=got)
     if task is not None:
         limit = {"max_steps": task.max_steps} if proxy.has_real_dynamics else {}
-        spaces, got = (shortened(x, 90) for x in (learned.interface, task.interface))
+        spaces = shortened(learned.interface, 90)
+        got = shortened(task.interface, 90)
         rule = f"must have spaces and step limit of {shortened(where, 40)}, {spaces}; got {got}."
         require(learned.interface | limit == task.interface, "task", rule)
     return registry.make("proxy", proxy, real)

@@ -199,9 +199,9 @@ class RewardEnv(ProxyEnv):
         if self.task.num_states is not None and not sees_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
-        values = {"discount": jnp.float32(1.0 if discount is None else discount)}
-        values["limit_is_terminal"] = jnp.bool_(limit_is_terminal)
-        return replace(params, potentials=potentials, **values)
+        gamma = jnp.float32(1.0 if discount is None else discount)
+        is_terminal = jnp.bool_(limit_is_terminal)
+        return replace(params, potentials=potentials, discount=gamma, limit_is_terminal=is_terminal)
 
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()

@@ -227,7 +227,9 @@ class SyntheticEnv(ProxyEnv):
         inputs = self._inputs(vector, action)
         outputs = [self._apply(weights, name, inputs) for name in ("state", "reward", "done")]
         state, reward, done = outputs
-        return state if self._units is None else self._units.decode(state), reward[0], done[0]
+        if self._units is not None:
+            state = self._units.decode(state)
+        return state, reward[0], done[0]
 
     def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
         """What the networks of a step see: the action, then the state in their units."""

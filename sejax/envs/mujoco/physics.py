@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import math
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,9 +68,9 @@ class Physics:
         nq, nv, nbody = self.model.nq, self.model.nv, self.model.nbody
         # As step.cc reports them, one after the other.
         shapes = (nq,), (nv,), (nq,), (nbody, 3), (nbody, 3), (nbody if with_forces else 0, 6)
-        self._num_reported = sum(map(math.prod, shapes))
         zeros: list[Any] = [np.zeros(shape, np.float32) for shape in shapes]
-        _, self._report_of = ravel_pytree(Report(*zeros))
+        vector, self._report_of = ravel_pytree(Report(*zeros))
+        self._num_reported = vector.size
 
     @property
     def dt(self) -> float:
