@@ -1,6 +1,5 @@
 """A task: a real environment that agents are tested on, and its spec."""
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -138,9 +137,9 @@ def _check_step(env: Environment, params: EnvParams, name: str) -> None:
         return expected, actual | {"reward": jnp.float32(reward), "terminated": terminated}
 
     def types(tree: PyTree) -> dict[str, str]:
-        name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
         leaves = jax.tree_util.tree_leaves_with_path(tree)
-        return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
+        flat = {jax.tree_util.keystr(path, simple=True, separator="."): x for path, x in leaves}
+        return {name: f"{x.dtype}{list(x.shape)}" for name, x in flat.items()}
 
     expected, actual = map(types, jax.eval_shape(step, jax.random.key(0)))
     keys = [x for x in expected | actual if expected.get(x) != actual.get(x)]

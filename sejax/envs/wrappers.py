@@ -158,7 +158,8 @@ class AsVectors(Wrapper[EnvState, EnvParams]):
         self, env: Environment, spaces: tuple[Space, Space], action_shape: tuple[int, ...]
     ):
         super().__init__(env)
-        self.spaces = observation, action = spaces
+        observation, action = spaces
+        self.spaces = spaces
         self._bounds = None
         if isinstance(action, Box):
             self._bounds = np.array([action.low, action.high], np.float32).reshape(2, *action_shape)

@@ -139,7 +139,7 @@ class SyntheticWorld:
         truncated = at_limit
         if self.config.horizon is not None:
             terminated = terminated | at_limit
-            truncated = at_limit & False
+            truncated = at_limit & False  # a horizon terminates instead
             discount = discount * (1 - at_limit)
         return outputs[..., :-2], reward, terminated, truncated, discount
 

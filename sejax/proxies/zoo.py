@@ -169,7 +169,8 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
       license: name of the license; by default that of the shipped proxies.
     """
     kind = proxy.kind if proxy.kind in _KINDS else "other"
-    call = ", ".join([f'"{source}"', *(f"{header.PLUGIN_ARGUMENTS[x]}=..." for x in proxy.needs)])
+    plugins = [f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in proxy.needs]
+    call = ", ".join([f'"{source}"', *plugins])
     words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in proxy.needs)
     gym = f"env = sejax.gym.make({call})  # a gymnasium.Env, in NumPy: any agent\n"
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
@@ -177,14 +178,13 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
         words += f" agent={best.agent}"
     if best and best.hparams != "default":
         words += f" agent_hparams={best.hparams}"
-    tags = ["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]
     plain = to_plain(proxy)
     if proxy.learning:
         plain["learning"].pop("command")  # the card shows it below
     facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
         "front": json.dumps(license) if hub.is_address(source) else None,
-        "tags": json.dumps(tags),
+        "tags": json.dumps(["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]),
         **{name: "" if name == kind else None for name in _KINDS},
         "facts": yaml.safe_dump(facts, sort_keys=False).rstrip(),
         "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
