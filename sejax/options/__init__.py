@@ -275,22 +275,22 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         problem = error.errors()[0]
         if typing.get_origin(hint) is Literal:
             raise unknown_name(name, str(got), typing.get_args(hint)) from None
-        must = problem["msg"].removeprefix("Input should ").partition(", unable")[0]
+        rule = problem["msg"].replace("Input should", "must").partition(", unable")[0]
         for bound, words in (("ge", "at least"), ("le", "at most")):
             if bound in problem.get("ctx", {}):
-                must = f"be {words} {problem['ctx'][bound]}"
+                rule = f"must be {words} {problem['ctx'][bound]}"
     else:
         if isinstance(got, bool) == isinstance(converted, bool):  # bools are numbers in Python
             return converted
-        must = f"be {'' if isinstance(converted, bool) else 'no '}true or false"
+        rule = f"must be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     use = "VALUE" if is_open else as_text(default)
     if isinstance(got, Mapping):
         raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.")
-    if must == "be a valid tuple":
-        must = "be a list in brackets"
+    if rule == "must be a valid tuple":
+        rule = "must be a list in brackets"
         use = f"[{shortened(got, 20)}]"
-    raise ConfigError(name, f"must {must}", got=repr(got), use=use)
+    raise ConfigError(name, rule, got=repr(got), use=use)
 
 
 @functools.cache

@@ -147,11 +147,11 @@ def require_typed(values: Mapping[str, Any], typed: Collection[str] = ()) -> Non
     Raises:
       ConfigError: for the first field of `NAMES_CODE` that names another one.
     """
-    must = "must be typed, as names in files are never imported"
+    rule = "must be typed, as names in files are never imported"
     for name, text in code_in(values).items():
         if ":" in text and text not in typed:
             use = f"{shortened(text, 60)}, if you trust it"
-            raise ConfigError(name.removesuffix(".name"), must, got=text, use=use)
+            raise ConfigError(name.removesuffix(".name"), rule, got=text, use=use)
 
 
 def code_in(values: Mapping[str, Any]) -> dict[str, str]:
@@ -201,8 +201,8 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
             value = {"name": registry.name_of(field.group, field.default), **value}
         return configure(field.group, value, field.name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
-        must = f"must have fields, as {field.name}.{next(iter(defaults_of(hint)), 'name')}"
-        require(isinstance(value, Mapping), field.name, must, got=repr(value), fix="Leave it out.")
+        rule = f"must have fields, as {field.name}.{next(iter(defaults_of(hint)), 'name')}"
+        require(isinstance(value, Mapping), field.name, rule, got=repr(value), fix="Leave it out.")
         base = to_plain(field.default) if isinstance(field.default, hint) else {}
         return from_plain(hint, base | value, field.name)
     return _leaf(value, hint, field)

@@ -176,9 +176,9 @@ def find(group: str, name: str) -> Any:
     base = resolve_name(GROUPS[group].base)
     is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
     is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
-    must = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
-    must += f" that derives from {base.__module__}.{base.__name__}"
-    require(is_fit, group, must, got=f"{shortened(name, 40)}, which is {plugin}")
+    rule = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
+    rule += f" that derives from {base.__module__}.{base.__name__}"
+    require(is_fit, group, rule, got=f"{shortened(name, 40)}, which is {plugin}")
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
         _NAMES[plugin] = name
     return plugin
@@ -283,8 +283,8 @@ def require_path(field: str, path: str) -> None:
     module, _, attribute = path.partition(":")
     is_path = all(map(str.isidentifier, [*module.split("."), *attribute.split(".")]))
     use = shortened((*_suggestions(path), "my_module:MyClass")[0], 60)
-    must = "must be a name or module:attribute"
-    require(is_path and not module.endswith(".py"), field, must, got=path, use=use)
+    rule = "must be a name or module:attribute"
+    require(is_path and not module.endswith(".py"), field, rule, got=path, use=use)
 
 
 def _suggestions(text: str) -> list[str]:
@@ -305,9 +305,9 @@ def imported(field: str, path: str) -> Any:
         return resolve_name(path)
     except Exception as error:
         is_lost = isinstance(error, ModuleNotFoundError) and not place_of(error)
-        must = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}."
-        must += " Is its folder in PYTHONPATH?" if is_lost else ""
-        raise ConfigError(field, must) from error
+        rule = f"must name what can be imported; {shortened(path, 60)} raised {told(error)}."
+        rule += " Is its folder in PYTHONPATH?" if is_lost else ""
+        raise ConfigError(field, rule) from error
 
 
 @functools.cache
@@ -318,10 +318,10 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     parameters = list(signature.parameters.values())
     options = parameters[len(arguments) :]
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
-    must = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field"
+    rule = f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field"
     is_fit = len(parameters) >= len(arguments) and not is_open
     is_fit &= all(p.name not in ("name", "make") for p in options)  # which every choice has
-    require(is_fit, group, must, got=f"{name}{signature}")
+    require(is_fit, group, rule, got=f"{name}{signature}")
 
     def make(self: object, *parts: object) -> Any:
         return function(*parts, **{p.name: getattr(self, p.name) for p in options})

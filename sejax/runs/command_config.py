@@ -229,8 +229,8 @@ class CommandConfig(Options, ABC):
             least = self.agents[key].steps_before_learning(length, spec.max_steps) // unit
             limit = getattr(training, name)
             is_longer = limit is None or limit > least
-            must = f"must exceed {least}, where {shortened(key)} begins to learn"
-            require(is_longer, f"{group}.{name}", must, got=limit, use=4 * least)
+            rule = f"must exceed {least}, where {shortened(key)} begins to learn"
+            require(is_longer, f"{group}.{name}", rule, got=limit, use=4 * least)
 
 
 Config = TypeVar("Config", bound=CommandConfig)
@@ -244,6 +244,6 @@ def without_repetitions(configs: Sequence[Config]) -> list[Config]:
     """
     by_folder = {str(config.folder): config for config in configs}
     are_apart = len(by_folder) == len({str(config) for config in configs})
-    must = "must differ for each run in letters or digits"
-    require(are_apart, configs[0].folder_field, must, got=next(iter(by_folder), ""))
+    rule = "must differ for each run in letters or digits"
+    require(are_apart, configs[0].folder_field, rule, got=next(iter(by_folder), ""))
     return [*by_folder.values()]

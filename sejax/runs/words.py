@@ -100,8 +100,8 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
-        must = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
-        raise ConfigError("preset", must, use="best") from error
+        rule = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
+        raise ConfigError("preset", rule, use="best") from error
 
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
