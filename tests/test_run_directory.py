@@ -216,7 +216,7 @@ def test_a_state_of_another_structure_is_refused(run, like):
         error = refusal(directory.restore, state_after(0) | like)
     assert error.field == "run_dir" and next(iter(like)) in str(error)
     with open_run(run) as directory:
-        assert "'key'] is" in str(refusal(directory.restore, {"x": state_after(0)["x"]}))
+        assert "'key'] (" in str(refusal(directory.restore, {"x": state_after(0)["x"]}))
 
 
 # --- another configuration -----------------------------------------------------------------------

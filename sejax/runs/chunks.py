@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import jax
-from jax import Array
 
 from sejax.bilevel import Bilevel, LearnState, make_bilevel
 from sejax.ops.parallel import compiler_options
@@ -34,7 +33,7 @@ class Chunks:
 
     def __init__(self, bilevel: Bilevel):
         self.bilevel = bilevel
-        self.init: Callable[[Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
+        self.init: Callable[[jax.Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
         self.compiled: dict[int, Chunk] = {}
 
     def compile(self, length: int) -> None:

@@ -27,7 +27,6 @@ def learning_curve(
     """
     data = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     x, mean, std = data["generation"], data["incumbent_mean"], data["incumbent_std"]
-    agents = [x.removeprefix("incumbent_mean_") for x in data if x.startswith("incumbent_mean_")]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7, 4))
         axis = figure.subplots()
@@ -36,9 +35,9 @@ def learning_curve(
         axis.fill_between(x, mean - std, mean + std, color=INCUMBENT, alpha=0.18, lw=0)
         axis.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         axis.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
-        for i, agent in enumerate(agents):
-            style: dict[str, Any] = {"color": f"C{i}", "lw": 1.3, "ls": "-."}
-            axis.plot(x, data[f"incumbent_mean_{agent}"], label=f"search mean: {agent}", **style)
+        for i, column in enumerate(name for name in data if name.startswith("incumbent_mean_")):
+            label = f"search mean: {column.removeprefix('incumbent_mean_')}"
+            axis.plot(x, data[column], color=f"C{i}", lw=1.3, ls="-.", label=label)
         if solved_score is not None:
             label = f"solved ({solved_score:g})"
             axis.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
@@ -58,8 +57,9 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
       path: the picture.
       title: what was checked, and the verdict.
     """
-    rows, rng = list(table["world"].unique()), np.random.default_rng(0)
-    kinds = list(dict.fromkeys(name.partition("-")[0] for name in table["agent"]))
+    rng = np.random.default_rng(0)
+    rows = list(table["world"].unique())
+    algorithms = list(dict.fromkeys(name.partition("-")[0] for name in table["agent"]))
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8, 1.5 + 0.8 * len(rows)))
         axis = figure.subplots()
@@ -68,7 +68,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
             for i, (name, returns) in enumerate(parts):
                 level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
                 spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
-                color = f"C{kinds.index(name.partition('-')[0])}"
+                color = f"C{algorithms.index(name.partition('-')[0])}"
                 axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
                 axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
                 axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)

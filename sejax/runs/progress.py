@@ -21,8 +21,10 @@ class RunProgress:
     """
 
     def __init__(self, config: LearnConfig, is_quiet: bool = False):
-        self._config, self._started, self._steps = config, time.monotonic(), 0
+        self._config = config
         self._is_quiet = is_quiet
+        self._started = time.monotonic()
+        self._steps = 0
         env, proxy = config.name("env"), config.name("proxy")
         if f"{env}-{proxy}" not in presets.PRESETS:
             none = f"There are no tuned settings for env={env} with proxy={proxy}"
@@ -30,7 +32,8 @@ class RunProgress:
 
     def status(self, text: str) -> None:
         """Prints a step of the work before a generation; steps per second count from it on."""
-        self._started, self._steps = time.monotonic(), 0
+        self._started = time.monotonic()
+        self._steps = 0
         self.say(f"{text} ...")
 
     def say(self, text: str) -> None:
@@ -42,12 +45,14 @@ class RunProgress:
         """Prints the numbers of a generation; steps per second are a mean."""
         self._steps += info.train_steps
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
-        values, agents = info.values, list(self._config.agents)
-        means = ", ".join(f"{x} {values[f'incumbent_mean_{x}']:.1f}" for x in agents if agents[1:])
+        values = info.values
+        start = "incumbent_mean_"  # a mixture has such a column for each agent
+        means = [f"{x.removeprefix(start)} {values[x]:.1f}" for x in values if x.startswith(start)]
+        by_agent = f" ({', '.join(means)})" if means else ""
         text = (
             f"generation {info.generation}/{self._config.generations - 1}: "  # from 0, as in files
             f"search mean {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
-            f"{means and f' ({means})'}, best {values['best_so_far']:.1f}, "
+            f"{by_agent}, best {values['best_so_far']:.1f}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         if values["num_nonfinite"]:
@@ -56,7 +61,8 @@ class RunProgress:
 
     def finish(self, directory: RunDirectory, bilevel: Bilevel, best: float) -> None:
         """Says how the run ended, where its files are, and what to do next."""
-        path, solved_score = directory.folder, bilevel.solved_score
+        path = directory.folder
+        solved_score = bilevel.solved_score
         is_solved = solved_score is not None and reaches(best, solved_score)
         verdict = f"best search mean {best:.1f}"
         if solved_score is not None:
@@ -64,14 +70,14 @@ class RunProgress:
         elif bilevel.scoring.objective.meaning:
             verdict += f": {bilevel.scoring.objective.meaning}"
         # The user must type the names of plugins: no name in a file is imported.
+        env, proxy = self._config.name("env"), self._config.name("proxy")
+        choices = {"env": env, "proxy_kind": proxy, "exploration": self._config.name("exploration")}
+        typed = {"proxy": path} | {field: x for field, x in choices.items() if ":" in x}
         agents = {k: registry.name_of("agent", x) for k, x in self._config.agents.items()}
-        is_own, proxy = any(":" in x for x in agents.values()), self._config.name("proxy")
-        env, explored = self._config.name("env"), self._config.name("exploration")
-        named = {"env": env, "proxy_kind": proxy, "exploration": explored}
-        typed = [f"{name}={text}" for name, text in named.items() if ":" in text]
-        own = [f"agents.{key}={name}" for key, name in agents.items()]
-        typed += [*own, "agent_hparams=as_learned"] if is_own else []
-        words = "".join(f" {shlex.quote(word)}" for word in typed)
+        if any(":" in name for name in agents.values()):
+            typed |= {f"agents.{key}": name for key, name in agents.items()}
+            typed["agent_hparams"] = "as_learned"
+        words = shlex.join(f"{field}={x}" for field, x in typed.items())
         arguments = ", task=YOUR_TASK" if ":" in env else ""
         arguments += ", proxy=YOUR_CONFIG" if ":" in proxy else ""
         self.say(
@@ -81,7 +87,7 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             "Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate {shlex.quote(f'proxy={path}')}{words} num_agents=20\n"
+            f"  python -m sejax.evaluate {words} num_agents=20\n"
             "Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{arguments})'
         )

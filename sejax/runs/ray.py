@@ -16,7 +16,6 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 import jax
@@ -34,12 +33,14 @@ from sejax.runs.config import LearnConfig, MachinesConfig
 from sejax.scoring import GenerationInfo
 
 WorkShare: TypeAlias = tuple[int, Trainings]  # an agent's index and trainings, whose keys are data
+# Computes shares: their outcomes and the CPU seconds that these took, in the order of the shares.
+Compute: TypeAlias = Callable[[Sequence[WorkShare]], Iterable[tuple[Outcome, float]]]
 BATCH = 16  # trainings in a share if neither the agent nor the user says how many
 RETRIES = 20  # how often Ray sends a share again if its worker dies
 LOOK_S = 1.0  # seconds between checks that the cluster still answers
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RayConfig(MachinesConfig):
     """Worker processes on a Ray cluster, each on a CPU core.
 
@@ -116,17 +117,13 @@ class RemoteChunks(Chunks):
 
     Args:
       config: the run's configuration.
-      compute: returns `outcomes_of` each share, in the order of the shares.
+      compute: returns `outcomes_of` each share.
 
     Attributes:
       cpu_s: CPU seconds that the workers spent on trainings.
     """
 
-    def __init__(
-        self,
-        config: LearnConfig,
-        compute: Callable[[Sequence[WorkShare]], Iterable[tuple[Outcome, float]]],
-    ):
+    def __init__(self, config: LearnConfig, compute: Compute):
         super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
         self._compute = compute
         self._sizes = share_sizes(self.bilevel, config.num_parallel)
@@ -199,9 +196,9 @@ def num_workers(machines: RayConfig) -> int:
 
     here = ray.get_runtime_context().get_node_id()
     if not any(node["NodeID"] == here and node["Alive"] for node in ray.nodes()):
+        what = "Ray has ended on this machine, so that no training can be sent out."
         fix = "The generations before are saved; start Ray and repeat the command to resume."
-        message = f"Ray has ended on this machine, so that no training can be sent out. {fix}"
-        raise FailedError(message)
+        raise FailedError(f"{what} {fix}")
     return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
@@ -218,12 +215,15 @@ def _on_cluster(
     import ray  # it comes with an extra
 
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
-    most, versions = num_workers(machines), runtime.versions()
-    tasks, running = list[Any](), list[Any]()
+    versions = runtime.versions()
+    limit = num_workers(machines)
+    tasks: list[Any] = []  # sent ones, in the order of their items
+    running: list[Any] = []
     try:
         for i in range(len(items)):
             while i >= len(tasks) or tasks[i] in running:
-                for item in items[len(tasks) :][: most - len(running)]:
+                num_free = limit - len(running)
+                for item in items[len(tasks) : len(tasks) + num_free]:
                     tasks.append(task.remote(versions, function, item))
                     running.append(tasks[-1])
                 done, running = ray.wait(running, timeout=LOOK_S)
@@ -242,10 +242,12 @@ def _on_cluster(
 
 def outcomes_of(setup: str, share: WorkShare) -> tuple[Outcome, float]:
     """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
-    (agent_index, trainings), started = share, time.process_time()
+    started = time.process_time()
+    agent_index, trainings = share
     size, program = _share_programs(setup)[agent_index]
     # Copies fill the share up; nothing is computed for them.
-    n, numbers = len(trainings.active), np.arange(size)
+    n = len(trainings.active)
+    numbers = np.arange(size)
     trainings = jax.tree.map(lambda x: x[np.minimum(numbers, n - 1)], trainings)
     outcome = program(dataclasses.replace(trainings, active=trainings.active & (numbers < n)))
     outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))

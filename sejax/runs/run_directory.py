@@ -12,12 +12,11 @@ from typing import Any, Self, TypeVar, cast
 import jax
 import numpy as np
 import yaml
-from jax import Array
 from jaxtyping import PyTree
 
 from sejax.ops.files import remove_leftovers, write_text
 from sejax.options import ConfigError
-from sejax.options.plain import code_in
+from sejax.options.plain import code_in, differences
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
@@ -65,7 +64,8 @@ class RunDirectory(Store):
     def __init__(self, config: LearnConfig, field: str = "run_dir"):
         super().__init__(config.folder, config.plain(), field=field, free=config.free)
         self.rows: list[dict[str, str]] = []
-        self.id, self.cpu_s = secrets.token_hex(4), 0.0
+        self.id = secrets.token_hex(4)
+        self.cpu_s = 0.0
         self.versions: object = runtime.versions()
         self._agents = tuple(config.agents) if len(config.agents) > 1 else ()
         of_agents = [f"{name}_{agent}" for agent in self._agents for name in AGENT_COLUMNS]
@@ -117,12 +117,11 @@ class RunDirectory(Store):
             state = as_tree(self._tensors, like)
         except ValueError as error:
             raise self.damaged(_CHECKPOINT, error) from error
-        self._tensors = None
         self._remake()
         return state
 
     def save(
-        self, state: PyTree[Array], info: GenerationInfo, wall_s: float, cpu_s: float
+        self, state: PyTree[jax.Array], info: GenerationInfo, wall_s: float, cpu_s: float
     ) -> list[dict[str, str]]:
         """Writes the checkpoint after a chunk of generations, then the files made from it.
 
@@ -139,15 +138,15 @@ class RunDirectory(Store):
           OSError: if a file cannot be written; the new or the previous checkpoint is then whole.
         """
         new = self._rows_of(info, wall_s)
-        csv, is_first = self._as_csv([*self.rows, *new]), not self.rows
+        csv = self._as_csv([*self.rows, *new])
         tensors = jax.device_get(_bare(_named(state)))  # all at once
         tensors[_ROWS] = np.frombuffer(csv.encode(), np.uint8)
         self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=runtime.versions())
-        self.rows, self.cpu_s = [*self.rows, *new], cpu_s
-        if is_first:
+        self.rows += new
+        self.cpu_s = cpu_s
+        write_text(self.folder / _METRICS, csv)
+        if not (self.folder / _CONFIG).exists():
             self._remake()
-        else:
-            write_text(self.folder / _METRICS, csv)
         return new
 
     def _as_csv(self, rows: Iterable[Mapping[str, str]]) -> str:
@@ -159,9 +158,10 @@ class RunDirectory(Store):
         """Reads the checkpoint, if there is one."""
         entry = self.get(_CHECKPOINT)
         if entry is None:  # then the folder must hold no run, also none of an older sejax
-            for name in filter(lambda name: (self.folder / name).exists(), _SIGNS):
-                must = "must be new or hold the checkpoint of its run"
-                raise self.refused(f"{must}; got {self.folder}, whose {name} would be replaced")
+            signs = [name for name in _SIGNS if (self.folder / name).exists()]
+            if signs:
+                got = f"{self.folder}, whose {signs[0]} would be replaced"
+                raise self.refused(f"must be new or hold the checkpoint of its run; got {got}")
             return
         tensors, values = entry
         try:
@@ -169,28 +169,29 @@ class RunDirectory(Store):
             rows = [dict(zip(header.split(","), x.split(","), strict=True)) for x in lines]
             # A column is nan if an older version did not write it.
             self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
-            self.id, self.cpu_s = str(values["id"]), float(values["cpu_s"])
+            self.id = str(values["id"])
+            self.cpu_s = float(values["cpu_s"])
             self.versions = values.get("versions", self.versions)
-            _ = float(self.last("wall_s")), int(self.last("env_steps_total"))
+            # The two raise for texts that are no numbers.
+            float(self.last("wall_s"))
+            int(self.last("env_steps_total"))
         except (KeyError, TypeError, ValueError) as error:
             raise self.damaged(_CHECKPOINT, error) from error
         self._tensors = tensors
 
     def _rows_of(self, info: GenerationInfo, wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a chunk."""
-        others = {"seed", "env_steps_total", "wall_s"}
-        values = {name: np.asarray(vars(info)[name]) for name in COLUMNS if name not in others}
+        columns = dict(vars(info))
         steps = np.asarray(info.real_steps, np.int64).sum(axis=1)
-        values["env_steps_total"] = int(self.last("env_steps_total")) + steps.cumsum()
+        columns["env_steps_total"] = int(self.last("env_steps_total")) + steps.cumsum()
         for i, agent in enumerate(self._agents):
             for name in AGENT_COLUMNS:
-                values[f"{name}_{agent}"] = np.asarray(vars(info.by_agent)[name])[:, i]
-        fixed = {"seed": str(self.settings["seed"]), "wall_s": f"{wall_s:.3f}"}
-        cells = [
-            fixed | {name: _as_text(column[i]) for name, column in values.items()}
+                columns[f"{name}_{agent}"] = getattr(info.by_agent, name)[:, i]
+        same = {"seed": str(self.settings["seed"]), "wall_s": f"{wall_s:.3f}"}  # in all rows
+        return [
+            {name: same.get(name) or _as_text(columns[name][i]) for name in self.columns}
             for i in np.flatnonzero(info.active)
         ]
-        return [{name: row[name] for name in self.columns} for row in cells]
 
     def _remake(self) -> None:
         """Writes the text files that differ from the checkpoint."""
@@ -221,11 +222,9 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
       ValueError: if the structure, a shape or a dtype differs.
     """
     leaves = _named(like)
-    there, here = _shapes(tensors), _shapes(jax.eval_shape(_bare, leaves))
-    for name in [*here, *there]:
-        stored, expected = there.get(name, "missing"), here.get(name, "missing")
-        if stored != expected:
-            raise ValueError(f"{name} is {stored}, and {expected} in this version")
+    differing = differences(_shapes(tensors), _shapes(jax.eval_shape(_bare, leaves)))
+    if differing:
+        raise ValueError(f"this version has a state of other shapes: {differing}")
     restored = []
     for name, leaf in leaves.items():
         array = jax.numpy.array(tensors[name])
@@ -233,18 +232,18 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
     return cast(State, jax.tree.unflatten(jax.tree.structure(like), restored))
 
 
-def _named(tree: PyTree) -> dict[str, Array]:
+def _named(tree: PyTree) -> dict[str, jax.Array]:
     return {_STATE + jax.tree_util.keystr(x): leaf for x, leaf in jax.tree.leaves_with_path(tree)}
 
 
-def _is_key(leaf: Array) -> bool:
+def _is_key(leaf: jax.Array) -> bool:
     return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
 
 
-def _bare(leaves: dict[str, Array]) -> dict[str, Array]:
+def _bare(leaves: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """The leaves, with PRNG keys as their data."""
     return {name: jax.random.key_data(x) if _is_key(x) else x for name, x in leaves.items()}
 
 
-def _shapes(arrays: Mapping[str, np.ndarray | Array]) -> dict[str, str]:
+def _shapes(arrays: Mapping[str, np.ndarray | jax.Array]) -> dict[str, str]:
     return {name: f"{x.dtype}{list(x.shape)}" for name, x in arrays.items()}

@@ -80,10 +80,9 @@ def configure_jax() -> None:
     if jax.config.jax_default_matmul_precision is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     root = files.cache_folder()
-    if root is None or jax.config.jax_compilation_cache_dir:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(root / cpu_name()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if root is not None and not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(root / cpu_name()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def cpu_name() -> str:

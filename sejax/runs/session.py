@@ -48,19 +48,16 @@ def run(
       ConfigError: if another version wrote the folder's state.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    report, bilevel = report or RunProgress(config, is_quiet=True), chunks.bilevel
+    report = report or RunProgress(config, is_quiet=True)
+    bilevel = chunks.bilevel
     # What the clocks lack of the seconds of all sessions.
     earlier_wall_s = float(directory.last("wall_s")) - time.monotonic()
     earlier_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
-
-    def spent() -> tuple[float, float]:
-        """Wall-clock and CPU seconds of all sessions."""
-        cpu_s = time.process_time() + chunks.cpu_s
-        return earlier_wall_s + time.monotonic(), earlier_cpu_s + cpu_s
-
     state = _begin(config.seed, directory, chunks, report)
-    drawn, num_trainings = time.monotonic(), sum(bilevel.evaluate.num_trainings)
-    folder, first = directory.folder.resolve(), len(directory.rows)
+    drawn = time.monotonic()
+    num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
+    folder = directory.folder.resolve()
+    first = len(directory.rows)
     about = TrackedRun(folder=folder, id=directory.id, generation=first, config=directory.settings)
     with contextlib.closing(GuardedTracker(config.tracker, about, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
@@ -71,7 +68,9 @@ def run(
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
-                rows = directory.save(saved, info, *spent())
+                wall_s = earlier_wall_s + time.monotonic()
+                cpu_s = earlier_cpu_s + time.process_time() + chunks.cpu_s
+                rows = directory.save(saved, info, wall_s, cpu_s)
                 save_proxies(directory, bilevel, saved, first)
             for generation in _finished(rows, info):
                 report.on_generation(generation)
@@ -80,7 +79,7 @@ def run(
                 draw(config, directory, bilevel)
                 drawn = time.monotonic()
         draw(config, directory, bilevel)
-    return _summary(directory, bilevel, state, *spent())
+    return _summary(directory, bilevel, state)
 
 
 def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgress) -> LearnState:
@@ -156,33 +155,24 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
         return
     best = state.best, state.best_score, state.best_scores, state.best_generation
     last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
-    first_agent, names = bilevel.layout.mixture.agents[0], bilevel.layout.mixture.names
-    discount = first_agent.discount(first_agent.hparams)
+    agent = bilevel.layout.mixture.agents[0]
+    names = bilevel.layout.mixture.names
+    discount: Any = agent.discount(agent.hparams)  # `save` takes an array of one number too
     # A proxy does not depend on the tracker, nor on the machines.
     config = {k: v for k, v in directory.settings.items() if k not in ("tracker", "machines")}
     for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
         path = directory.folder / f"{name}.safetensors"
         if (generation < first and path.exists()) or not np.isfinite(flat).all():
             continue
-        by_agent = dict(zip(names, map(float, scores), strict=True))
-        save(
-            path,
-            bilevel.proxy,
-            bilevel.unravel(flat),
-            config,
-            None if discount is None else float(discount),
-            score=float(score),
-            generation=int(generation),
-            seed=directory.settings["seed"],
-            **({"scores": by_agent} if len(names) > 1 else {}),
-        )
+        record = {"score": float(score), "generation": int(generation), "seed": config["seed"]}
+        if len(names) > 1:
+            record["scores"] = dict(zip(names, map(float, scores), strict=True))
+        save(path, bilevel.proxy, bilevel.unravel(flat), config, discount, **record)
 
 
-def _summary(
-    directory: RunDirectory, bilevel: Bilevel, state: LearnState, wall_s: float, cpu_s: float
-) -> dict[str, Any]:
+def _summary(directory: RunDirectory, bilevel: Bilevel, state: LearnState) -> dict[str, Any]:
     """Writes `run.json`, unless the same is there, and returns its content."""
-    file, generations = directory.folder / "run.json", len(directory.rows)
+    file = directory.folder / "run.json"
     num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
     is_measured = state.best_generation >= 0
     means = [float(x["train_steps_mean"]) for x in directory.rows]
@@ -190,8 +180,8 @@ def _summary(
         "ended": "solved" if state.solved else "finished" if is_measured else "diverged",
         "best_score": float(state.best_score) if is_measured else None,
         "solved_score": bilevel.solved_score,
-        "generations": generations,
-        "agents": generations * num_trainings,
+        "generations": len(directory.rows),
+        "agents": len(directory.rows) * num_trainings,
         "train_steps": sum(round(mean * num_trainings) for mean in means),
         "real_steps": int(directory.last("env_steps_total")),
     }
@@ -201,8 +191,8 @@ def _summary(
             return stored  # which names the machine that computed it
     versions = runtime.versions() | {package: version(package) for package in PACKAGES}
     summary = counts | {
-        "wall_s": round(wall_s, 1),
-        "cpu_s": round(cpu_s, 1),
+        "wall_s": round(float(directory.last("wall_s")), 1),
+        "cpu_s": round(directory.cpu_s, 1),
         "devices": [str(device) for device in jax.devices()],
         "machine": f"{platform.platform()}, {runtime.available_cores()} cores",
         "versions": {"python": platform.python_version()} | versions,
@@ -213,10 +203,9 @@ def _summary(
 
 def draw(config: LearnConfig, directory: RunDirectory, bilevel: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
-    if directory.rows:
-        path = directory.folder / "learning_curve.png"
-        title = ", ".join(map(config.name, ("env", "proxy", "agent")))
-        plots.learning_curve(directory.rows, bilevel.solved_score, path, title)
+    path = directory.folder / "learning_curve.png"
+    title = ", ".join(map(config.name, ("env", "proxy", "agent")))
+    plots.learning_curve(directory.rows, bilevel.solved_score, path, title)
 
 
 def _finished(rows: list[dict[str, str]], info: GenerationInfo) -> Iterator[FinishedGeneration]:

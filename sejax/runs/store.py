@@ -20,8 +20,11 @@ from sejax.ops.files import missing, remove_empty, write_bytes
 from sejax.options import ConfigError, shortened
 from sejax.options.plain import differences
 
+Plain: TypeAlias = Mapping[str, Any]  # plain values in nested mappings
 Tensors: TypeAlias = Mapping[str, np.ndarray]  # by name
-KIND, FORMAT_VERSION = "sejax_run", 1  # in all files since the first release
+# In all files since the first release.
+KIND = "sejax_run"
+FORMAT_VERSION = 1
 LOCK = "sejax.lock"  # the file that a process locks while it uses the folder
 
 
@@ -30,7 +33,7 @@ class Store:
 
     Args:
       folder: the folder, made with the first entry or lock.
-      settings: plain values in nested mappings, on which all entries depend.
+      settings: what all entries depend on.
       field: the field that names the folder, for messages.
       free: groups and fields of the first level that may differ: they say how to compute, not what.
 
@@ -50,16 +53,12 @@ class Store:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        settings: Mapping[str, Any],
-        *,
-        field: str = "run_dir",
-        free: Collection[str] = (),
+        self, folder: Path, settings: Plain, *, field: str = "run_dir", free: Collection[str] = ()
     ):
         self.folder = folder
         self.settings: dict[str, Any] = json.loads(json.dumps(settings))
-        self._field, self._free = field, free
+        self._field = field
+        self._free = free
         self._lock = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
         self._has_entry = False
 
@@ -107,7 +106,8 @@ class Store:
         """
         try:
             tensors, values = checksummed.read(self.file(name), KIND)
-            version, stored = values.pop("format_version"), dict(values.pop("config"))
+            version = values.pop("format_version")
+            stored = dict(values.pop("config"))
             if version != FORMAT_VERSION:
                 raise ValueError(f"its format is {version}")
         except FileNotFoundError:
@@ -117,8 +117,7 @@ class Store:
         self._has_entry = True
         differing = differences(stored, self.settings, self._free)
         if differing:
-            stored = self.completed(stored)
-            differing = differences(stored, self.settings, self._free)
+            differing = differences(self.completed(stored), self.settings, self._free)
         if differing:
             must = "must be new or made with the same settings"
             raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
@@ -150,9 +149,10 @@ class Store:
           OSError: as `put`.
         """
         entry = self.get(name)
-        tensors = dict(compute()) if entry is None else entry[0]
-        if entry is None:
-            self.put(name, tensors)
+        if entry is not None:
+            return entry[0]
+        tensors = dict(compute())
+        self.put(name, tensors)
         return tensors
 
     def completed(self, stored: dict[str, Any]) -> dict[str, Any]:

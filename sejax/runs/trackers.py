@@ -111,7 +111,8 @@ class TensorBoardConfig:
 
         # Later generations of a killed session are purged. The suffix keeps that session's file
         # from being replaced by a file that begins in the same second.
-        folder, suffix = str(run.folder / "tensorboard"), f".{run.generation}"
+        folder = str(run.folder / "tensorboard")
+        suffix = f".{run.generation}"
         writer = SummaryWriter(folder, purge_step=run.generation, filename_suffix=suffix)
         text = yaml.safe_dump(run.config, sort_keys=False)
         writer.add_text("config", f"```\n{text}```", run.generation)
