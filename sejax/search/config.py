@@ -54,9 +54,9 @@ class StudyConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        least, most = self.min_generations, self.max_generations
+        low, high = self.min_generations, self.max_generations
         must = "must be at least min_generations"
-        require(most >= least, "max_generations", must, got=most, use=9 * least)
+        require(high >= low, "max_generations", must, got=high, use=9 * low)
 
     @property
     def rungs(self) -> list[int]:
@@ -125,7 +125,8 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     Raises:
       ConfigError: for a bad value, for a field that cannot be searched, or if nothing is searched.
     """
-    by_name, known = {x.partition("=")[0]: x for x in overrides}, defaults_of(StudyConfig)
+    known = defaults_of(StudyConfig)
+    by_name = {x.partition("=")[0]: x for x in overrides}
     of_run = [name for name in by_name if name.partition(".")[0] not in known]
     texts = {name: by_name[name].partition("=")[2] for name in of_run}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
@@ -140,12 +141,12 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     space = {name: spaces.parse(name, text) for name, text in ranges.items()}
     fixed = tuple(f"{name}={text}" for name, text in others.items())
     plan = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
-    default, preset = plan.default, plan.config.space
-    if preset is not None:
+    default = plan.default
+    if plan.config.space is not None:
         by_key = default.agents.items()
         agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
         typed = default.named(LearnConfig.layers_of(fixed)["typed"])
-        for name, dimension in spaces.preset(preset, agents).items():
+        for name, dimension in spaces.preset(plan.config.space, agents).items():
             if name not in typed:
                 space.setdefault(name, dimension)
     fields = default.named(default.plain())

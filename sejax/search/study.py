@@ -7,7 +7,6 @@ process, even if that is killed. The next worker goes on with a running trial wh
 import contextlib
 import dataclasses
 import functools
-import math
 import shlex
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -156,11 +155,8 @@ def work(study: optuna.Study, plan: StudyPlan) -> None:
 
 def _claimed(study: optuna.Study, plan: StudyPlan, held: contextlib.ExitStack) -> Trial | None:
     """A trial whose worker is lost, or a new one, with its lock held; None if enough have ended."""
-    known = study.get_trials(deepcopy=False)
     space = {x.parameter: x.distribution for x in plan.space.values()}
-    for frozen in known:
-        if frozen.state != TrialState.RUNNING:
-            continue
+    for frozen in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
         try:
             held.enter_context(_lock(plan, _name(frozen.number), timeout=0))
         except filelock.Timeout:  # its worker is alive
@@ -172,6 +168,7 @@ def _claimed(study: optuna.Study, plan: StudyPlan, held: contextlib.ExitStack) -
         for name, distribution in space.items():  # the trial may lack some parameters
             trial._suggest(name, distribution)
         return trial
+    known = study.get_trials(deepcopy=False)
     if sum(trial.state.is_finished() for trial in known) >= plan.config.trials:
         return None
     if not any(trial.state == TrialState.WAITING for trial in known):
@@ -187,8 +184,8 @@ def _claimed(study: optuna.Study, plan: StudyPlan, held: contextlib.ExitStack) -
 
 def _copy(study: optuna.Study) -> optuna.Study:
     """A copy in memory; changes to it do not change the study."""
-    name, pruner = study.study_name, study.pruner
-    copy = optuna.create_study(study_name=name, pruner=pruner, direction="maximize")
+    name = study.study_name  # the pruner draws a trial's bracket by it
+    copy = optuna.create_study(study_name=name, pruner=study.pruner, direction="maximize")
     copy.add_trials(study.get_trials(deepcopy=False))
     return copy
 
@@ -198,21 +195,23 @@ def _is_behind(trial: Trial, rung: int) -> bool:
 
     The answer is kept before Optuna hears that the trial has reached the rung: it answers once.
     """
-    study, name = trial.study, f"pruned_at_{rung}"
+    name = f"pruned_at_{rung}"
     if name not in trial.user_attrs:
-        copy = _copy(study)
-        trial.set_user_attr(name, study.pruner.prune(copy, copy.trials[trial.number]))
+        copy = _copy(trial.study)
+        trial.set_user_attr(name, copy.pruner.prune(copy, copy.trials[trial.number]))
     trial.should_prune()
     return bool(trial.user_attrs[name])
 
 
 def _computed(trial: Trial, plan: StudyPlan) -> str:
     """Computes a trial rung by rung, until it is pruned or complete; returns a line about it."""
-    study, overrides = trial.study, plan.overrides(trial.params)
-    folder, seeds = plan.folder / _name(trial.number), range(plan.config.seeds)
-    trial.set_user_attr("settings", shlex.join(overrides))
+    study = trial.study
+    overrides = plan.overrides(trial.params)
+    settings = shlex.join(overrides)
+    trial.set_user_attr("settings", settings)
     try:
-        run = learning(plan.trial_config(overrides), folder, seeds)
+        config = plan.trial_config(overrides)
+        run = learning(config, plan.folder / _name(trial.number), range(plan.config.seeds))
     except ConfigError as error:  # settings that cannot work together
         trial.set_user_attr("refused", str(error))
         study.tell(trial, state=TrialState.PRUNED)
@@ -228,11 +227,10 @@ def _computed(trial: Trial, plan: StudyPlan) -> str:
     trial.set_user_attr("generations", progress.generations)
     trial.set_user_attr("train_steps", progress.train_steps)
     score = float(progress.scores[-1])
-    if rung == last and math.isfinite(score):
+    if rung == last and np.isfinite(score):
         study.tell(trial, score)
     else:
         study.tell(trial, state=TrialState.PRUNED)
-    settings = trial.user_attrs["settings"]
     return f"{score:.4g} after {progress.generations:g} of {last} generations: {settings}"
 
 
@@ -280,10 +278,10 @@ def _tried_again(study: optuna.Study, plan: StudyPlan, number: int) -> dict[str,
 
     The best score of many is the luckiest too.
     """
-    config, folder = plan.config, plan.folder / f"verified/{number:04d}"
-    fresh = range(config.seeds, config.seeds + config.fresh_seeds)
-    trial = plan.trial_config(plan.overrides(study.trials[number].params))
-    progress = learning(trial, folder, fresh)(config.max_generations)
+    config = plan.trial_config(plan.overrides(study.trials[number].params))
+    fresh = range(plan.config.seeds, plan.config.seeds + plan.config.fresh_seeds)
+    run = learning(config, plan.folder / f"verified/{number:04d}", fresh)
+    progress = run(plan.config.max_generations)
     return {"verified": float(progress.scores[-1]), "verified_cost": progress.generations}
 
 
