@@ -19,7 +19,6 @@ import dataclasses
 import functools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -30,7 +29,6 @@ import yaml
 from pydantic import Field
 
 from sejax import agents
-from sejax.agents.base import AgentConfig
 from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import counted
@@ -62,7 +60,7 @@ SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
 Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class CheckConfig(FreshAgentsConfig):
     """What `sejax.check` takes.
 
@@ -129,11 +127,16 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
     proxy = _judgeable(config)
-    task, learned, others = proxy.task, config.agents, _others(config, proxy)
-    myopic = _myopic(learned) if proxy.env.max_steps > 1 else {}
+    task = proxy.task
+    learned: dict[str, Any] = config.agents
+    others = _others(config, task)
     students = learned | others
-    for of_discount in myopic.values():
-        students |= of_discount
+    myopic = {}  # keys of agents, by row
+    # In one step a discount has no effect.
+    for discount in DISCOUNTS if proxy.env.max_steps > 1 else ():
+        of_row = {f"{key}-{discount:g}": agent for key, agent in learned.items()}
+        students |= {k: dataclasses.replace(x, discount=discount) for k, x in of_row.items()}
+        myopic[MYOPIC.format(discount)] = list(of_row)
     worlds = fresh_agents.worlds_of(dataclasses.replace(config, agents=students)).values()
     on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
@@ -147,15 +150,18 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     store = Store(config.folder, settings, field="out_dir", free=config.free)
     with store, config.machines.pool() as pool:
         store.once("check", dict)  # settings are compared, whatever `num_agents` is
-        table, null = _trained(config, rows, store, pool), dict[str, Any]()
-        rows, known = {}, [*learned, *others]
+        table = _trained(config, rows, store, pool)
+        null: dict[str, Any] = {}
+        rows = {}
         if not proxy.env.is_real and task.num_states is None:
             steps = table.groupby("agent")["train_steps"].mean()
+            lengths = {key: ceil(steps[key]) for key in (*learned, *others)}
             world, null = _null(config, task, on_proxy.trainings, store)
-            rows[NULL] = _of_lengths(world, {key: ceil(steps[key]) for key in known}), known
-        rows[TASK] = on_task, [*learned][: None if proxy.env.is_real else 1]
+            rows[NULL] = _of_lengths(world, lengths), lengths
+        first = [*learned][:1]
+        rows[TASK] = on_task, learned if proxy.env.is_real else first
         rows[TUNED] = on_task, [tuned]
-        rows[NOTHING] = _of_lengths(on_task, dict.fromkeys(learned, 1)), [*learned][:1]
+        rows[NOTHING] = _of_lengths(on_task, dict.fromkeys(first, 1)), first
         table = pd.concat([table, _trained(config, rows, store, pool)], ignore_index=True)
         return _reported(proxy, null, [*learned], table, config.folder)
 
@@ -178,13 +184,13 @@ def _judgeable(config: CheckConfig) -> Proxy:
 # --- who trains where -----------------------------------------------------------------------------
 
 
-def _others(config: CheckConfig, proxy: Proxy) -> dict[str, AgentConfig]:
+def _others(config: CheckConfig, task: Task) -> dict[str, agents.AgentConfig]:
     """Agents of algorithms that the proxy was not learned with.
 
     Raises:
       ConfigError: if one of them, or of the proxy's agents, does not fit the task.
     """
-    task, learned = proxy.task, config.agents
+    learned = config.agents
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
     with errors_of("agent", "algorithms"):
@@ -195,17 +201,7 @@ def _others(config: CheckConfig, proxy: Proxy) -> dict[str, AgentConfig]:
     return others
 
 
-def _myopic(learned: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The proxy's agents with lower discounts, by row of the table and by key."""
-    return {
-        MYOPIC.format(x): {
-            f"{key}-{x:g}": dataclasses.replace(agent, discount=x) for key, agent in learned.items()
-        }
-        for x in DISCOUNTS
-    }
-
-
-def _tuned(task: Task) -> AgentConfig:
+def _tuned(task: Task) -> agents.AgentConfig:
     """An agent with the settings of `preset=best`, but one warm-up episode: SEs alone need more.
 
     Tabular agents have none, as by default.
@@ -246,12 +242,14 @@ def _null(
     fields = ARS | {"alive_bonus": dict[str, Any](task.origin or {}).get("healthy_reward", 0.0)}
     search = PolicySearchConfig(**fields, generations=generations, until_solved=True)
     (lesson,), costs = search_policies(search, task, 1, keys, store, config.devices)
-    method, steps = "a random search", costs["real_steps"].sum()
+    method = "a random search"
+    steps = costs["real_steps"].sum()
     if not reaches(lesson.policy_return, task.solved_reward):
         how = CopyConfig(agent_steps=config.null_steps)
         (other,), costs = copy_policy(how, task, "ppo", keys, store)
         steps += costs["real_steps"].sum()
-        method, lesson = max(((method, lesson), ("a PPO", other)), key=lambda x: x[1].policy_return)
+        if other.policy_return > lesson.policy_return:
+            method, lesson = "a PPO", other
     env, weights = make_exact(task, lesson.layers, lesson.states)
     about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
     return World(env, env.params(weights), task, trainings), about
@@ -278,43 +276,45 @@ def _reported(
     proxy: Proxy, null: dict[str, Any], learned: list[str], table: pd.DataFrame, folder: Path
 ) -> dict[str, Any]:
     """Prints and writes the findings."""
-    task, is_rn = proxy.task, proxy.env.is_real
-    table = _scored(table, task, is_rn)
+    task = proxy.task
+    table = _scored(table, proxy)
     summary = fresh_agents.summarise(table, ["world"])
-    judgements = _judgements(table, learned, task, is_rn)
-    teaches = "its reward teaches" if is_rn else "its dynamics teach"  # an RN's are the task's
+    judgements = _judgements(table, learned, proxy)
+    # The dynamics of an RN are the task's.
+    teaches = "its reward teaches" if proxy.env.is_real else "its dynamics teach"
     verdict = verdict_of(judgements.values(), teaches)
-    found = {"null_se": null, "cost": _cost(proxy, summary), "verdict": verdict}
+    report = {"null_se": null, "cost": _cost(proxy, summary), "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
-    printed = {name: x for name, x in found.items() if x}
+    printed = {name: x for name, x in report.items() if x}
     shares = table.groupby(["world", "agent"], sort=False)["solved"].mean().map("{:.0%}".format)
     shares = shares.reset_index("agent")
     solved = (shares["agent"] + " " + shares["solved"]).groupby("world").agg(", ".join)
     shown = summary.set_index(solved[summary.index], append=True)
     fresh_agents.print_table(shown, title, yaml.safe_dump(printed, sort_keys=False).strip(), SHOWN)
-    found["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
-    found["worlds"] = summary.assign(solved=solved).to_dict("index")
-    write_text(folder / "check.json", json.dumps(found, indent=1) + "\n")
+    report["judgements"] = {key: judgement._asdict() for key, judgement in judgements.items()}
+    report["worlds"] = summary.assign(solved=solved).to_dict("index")
+    write_text(folder / "check.json", json.dumps(report, indent=1) + "\n")
     plots.check(table, task.solved_reward, folder / "check.png", f"{proxy.path.stem}: {verdict}")
-    return found
+    return report
 
 
-def _scored(table: pd.DataFrame, task: Task, is_rn: bool) -> pd.DataFrame:
+def _scored(table: pd.DataFrame, proxy: Proxy) -> pd.DataFrame:
     """The table with scores: returns for an SE, minus the training steps for an RN."""
     is_lost = table["nonfinite"] > 0
     returns = counted(table["test_return"].mask(is_lost))
     steps = table["train_steps"].mask(is_lost, table["train_steps"].max())
-    score, solved = -steps if is_rn else returns, reaches(returns, task.solved_reward)
+    score = -steps if proxy.env.is_real else returns
+    solved = reaches(returns, proxy.task.solved_reward)
     return table.assign(test_return=returns, train_steps=steps, score=score, solved=solved)
 
 
-def _judgements(
-    table: pd.DataFrame, learned: list[str], task: Task, is_rn: bool
-) -> dict[str, Judgement]:
+def _judgements(table: pd.DataFrame, learned: list[str], proxy: Proxy) -> dict[str, Judgement]:
     """The myopia test of each algorithm that the proxy was learned with."""
     by_agent = table.groupby(["world", "agent"], sort=False)["score"]
     scores = {name: score.to_numpy() for name, score in by_agent}
-    judgements, top = {}, 0.0 if is_rn else float(task.solved_reward)
+    is_rn = proxy.env.is_real
+    top = 0.0 if is_rn else float(proxy.task.solved_reward)
+    judgements = {}
     for key in learned:
         floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
         myopic = scores.get((MYOPIC.format(0), f"{key}-0"), scores[OWN, key])
@@ -327,14 +327,14 @@ def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
 
     "never" if agents trained on the proxy do not reach the solved score.
     """
-    learning, is_rn = zoo.describe(header.read(proxy.path)).learning, proxy.env.is_real
+    learning = zoo.describe(header.read(proxy.path)).learning
     record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
     with contextlib.suppress(OSError, ValueError):
         record = record or json.loads(proxy.path.with_name("run.json").read_text())
     cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
     if cost:
         steps, returns = summary["train_steps_mean"], summary["test_return_mean"]
-        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if is_rn else 0)
+        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if proxy.env.is_real else 0)
         pays = saved > 0 and reaches(returns[OWN], float(proxy.task.solved_reward))
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if pays else "never"
     return cost

@@ -84,8 +84,8 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     distances = np.abs([lost.mean() - margin, gained.mean() - margin])
     # The width of an interval falls with the square root of the number of agents.
     needed = len(far) * np.max((halves / np.maximum(distances, 1e-9)) ** 2)
-    missing = math.ceil(min(needed, 1e6)) - len(far) if math.isfinite(needed) else ENOUGH - len(far)
-    return Judgement(verdict, float(lost.mean()), low, high, max(1, missing))
+    num_agents = math.ceil(min(needed, 1e6)) if math.isfinite(needed) else ENOUGH
+    return Judgement(verdict, float(lost.mean()), low, high, max(1, num_agents - len(far)))
 
 
 def verdict_of(judgements: Collection[Judgement], teaches: str = "its dynamics teach") -> str:
