@@ -81,7 +81,8 @@ class DistillConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        spec, task_name = envs.spec_of(self.env), registry.name_of("env", self.env)
+        spec = envs.spec_of(self.env)
+        task_name = registry.name_of("env", self.env)
         is_fit = spec.states == "vector"
         require(is_fit, "env", "must observe vectors", got=task_name, use="cartpole")
         for key, agent in self.agents.items():
@@ -154,30 +155,32 @@ def distill(config: DistillConfig, words: str = "") -> Path:
     with Store(config.folder, config.plain(), free=config.free) as store:
         if store.get(BEGUN) is None:  # it raises for other settings
             for name in filter(lambda name: store.file(name).exists(), ("proxy", "checkpoint")):
-                must = f"must hold no {name} of another command; got {store.folder}"
-                raise store.refused(must)
+                raise store.refused(f"must hold no {name} of another command; got {store.folder}")
         return _distilled(config, store, words)
 
 
 def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
-    task, folder = envs.make_from(config.env), store.folder
+    folder = store.folder
+    task = envs.make_from(config.env)
     # The last key also tests policies. The unused key "nothing" keeps the numbers of old runs.
     uses = ("search", "nothing", "record", CHOOSE, TEST)
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
     if config.policy is None:
         store.put(BEGUN)
-        shared = config.num_snapshots, keys, store, config.devices
-        lessons, costs = search_policies(config.search, task, *shared)
+        lessons, costs = search_policies(
+            config.search, task, config.num_snapshots, keys, store, config.devices
+        )
         write_text(folder / "search.csv", costs.to_csv(index=False))
     else:
         lessons, costs = copy_policy(config.copy, task, config.policy, keys, store)
         store.put(BEGUN)  # now that the policy is known to be one
     ses = [make_exact(task, x.layers, x.states, config.independent_starts) for x in lessons]
-    best, rows = 0, pd.DataFrame()
+    best = 0
+    rows = pd.DataFrame()
     if len(lessons) > 1:
         student_keys = jax.random.split(keys[CHOOSE], config.num_students)
-        rows = students(ses, lessons, config, student_keys, store)
-        rows["use"], marks = CHOOSE, grades(rows)
+        rows = students(ses, lessons, config, student_keys, store).assign(use=CHOOSE)
+        marks = grades(rows)
         print(f"mean and worst student, by the policy's generation:\n{marks.to_string()}")
         best = [lesson.generation for lesson in lessons].index(int(marks.idxmax()))
     se, lesson = ses[best], lessons[best]
@@ -196,7 +199,8 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
     }
     record: dict[str, Any] = {"generation": lesson.generation, "seed": config.seed}
     record |= {"learning": learning, "policy_return": lesson.policy_return}
-    path, settings = folder / "proxy.safetensors", config.plain()
+    path = folder / "proxy.safetensors"
+    settings = config.plain()
     learned_with = {name: settings[name] for name in ("agents", "exploration", "training", "seed")}
     save(path, *se, learned_with, **record, evaluations=evaluations_of(tested))
     write_text(folder / "card.md", zoo.describe(header.read(path), str(folder)).card + "\n")

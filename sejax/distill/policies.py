@@ -30,12 +30,13 @@ from sejax.distill.policy_search import Arrays, Lesson, random_map
 from sejax.envs.base import Task
 from sejax.options import Count, Options, WholeNumber, registry, require, shortened
 from sejax.options.plain import configure
-from sejax.proxies.exact import Layer, forward, require_vectors
+from sejax.proxies.exact import Layer, forward
 from sejax.runs.store import Store
 from sejax.training import TrainingConfig, make_trainer
 
 # Observations [state, obs_dim] to actions [state] or [state, action_dim], of NumPy.
 Actor = Callable[[np.ndarray], np.ndarray]
+Scale = tuple[np.ndarray, np.ndarray]  # mean and deviation, which whiten observations
 FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), module:function, or an agent such as ppo."
 _POLICY_ERROR = 0.1  # of a copy in an episode, root mean square in units of the action's bound
 _BATCH_SIZE, _LEARNING_RATE = 256, 3e-3  # of the fit, by Adam
@@ -93,7 +94,7 @@ def _checked(act: Actor, task: Task) -> Actor:
     must = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
 
     def checked(obs: np.ndarray) -> np.ndarray:
-        shape = (len(obs), *(() if count is not None else (task.action_dim,)))
+        shape = (len(obs), task.action_dim) if count is None else (len(obs),)
         try:
             actions = np.asarray(act(obs), float)
         except Exception as error:
@@ -119,12 +120,13 @@ def _of_sb3(text: str, task: Task) -> Actor:
         must = f"must be a model that its algorithm saved; got {got}"
         raise options.ConfigError("policy", must, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
-    is_discrete, space = task.num_actions is not None, model.action_space
+    space = model.action_space
+    is_discrete = task.num_actions is not None
     is_fit = hasattr(space, "n") == is_discrete
     require(is_fit, "policy", f"must have the actions of {task.name}", got=space, fix=FIX)
     low, high = np.asarray((-1, 1) if is_discrete else (space.low, space.high), float)
-    middle, factor = (low + high) / 2, 2 * task.max_action / (high - low)
-    return lambda obs: (model.predict(obs, deterministic=True)[0] - middle) * factor
+    factor = 2 * task.max_action / (high - low)
+    return lambda obs: (model.predict(obs, deterministic=True)[0] - (low + high) / 2) * factor
 
 
 def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
@@ -155,21 +157,20 @@ def copy_policy(
       keys: `search`, for training an agent; `record`, for episodes, errors and fits.
       store: where the copy of an agent is kept; the code of a function or a model may change.
     """
-    require_vectors(task)
     compute = functools.partial(_copy, config, task, policy, keys)
-    found = store.once("copy", compute) if registry.is_registered("agent", policy) else compute()
-    kernels, biases = ([found[x] for x in sorted(found) if y in x] for y in ("kernel", "bias"))
-    layers, policy_return = [*zip(kernels, biases, strict=True)], found["policy_return"].item()
-    costs = pd.DataFrame({name: [found[name].item()] for name in ("real_steps", "cpu_s")})
-    return [Lesson(0, layers, found["states"], policy_return)], costs
+    copied = store.once("copy", compute) if registry.is_registered("agent", policy) else compute()
+    num_layers = 1 + (config.hidden_size > 0)
+    layers = [(copied[f"kernel{i}"], copied[f"bias{i}"]) for i in range(num_layers)]
+    costs = pd.DataFrame({name: [copied[name].item()] for name in ("real_steps", "cpu_s")})
+    return [Lesson(0, layers, copied["states"], copied["policy_return"].item())], costs
 
 
 def _copy(config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]) -> Arrays:
     """The copy's layers, the states that the policy visits, its return, and the costs, by name."""
-    started, key = time.process_time(), keys["record"]
+    started = time.process_time()
     act = policy_of(policy, task, config.agent_steps, keys["search"])
     # One key is unused: without it the numbers of stored proxies would change.
-    key, key_visit, _, key_fit = jax.random.split(key, 4)
+    key, key_visit, _, key_fit = jax.random.split(keys["record"], 4)
     policy_states, policy_return = visit(task, act, key_visit, config.episodes)
     scale = policy_states.mean(0), np.maximum(policy_states.std(0), 1e-2)
     states, actions = policy_states, act(policy_states)
@@ -183,13 +184,13 @@ def _copy(config: CopyConfig, task: Task, policy: str, keys: Mapping[str, Array]
         layers = fit(config, task, states, actions, scale, key_fit)
     tested, copy_return = visit(task, acting(task, layers), key, config.episodes)
     print(f"policy {policy_return:.1f}, its copy {copy_return:.1f}", flush=True)
-    agent_steps = config.agent_steps * registry.is_registered("agent", policy)
+    agent_steps = config.agent_steps if registry.is_registered("agent", policy) else 0
     real_steps = len(states) + len(tested) + agent_steps
     costs = {"real_steps": real_steps, "cpu_s": time.process_time() - started}
-    found = costs | {"states": policy_states, "policy_return": policy_return}
+    values = costs | {"states": policy_states, "policy_return": policy_return}
     for i, (kernel, bias) in enumerate(layers):
-        found |= {f"kernel{i}": kernel, f"bias{i}": bias}
-    return {name: np.asarray(value) for name, value in found.items()}
+        values |= {f"kernel{i}": kernel, f"bias{i}": bias}
+    return {name: np.asarray(value) for name, value in values.items()}
 
 
 def acting(task: Task, layers: Sequence[Layer], error: Actor = lambda obs: np.zeros(1)) -> Actor:
@@ -243,7 +244,9 @@ def visit(task: Task, act: Actor, key: Array, episodes: int) -> tuple[np.ndarray
     dtype = np.int32 if task.num_actions is not None else np.float32
     key_reset, key_steps = jax.random.split(key)
     obs, state = reset(jax.random.split(key_reset, episodes))
-    active, returns, seen = np.ones(episodes, bool), np.zeros(episodes), []
+    active = np.ones(episodes, bool)
+    returns = np.zeros(episodes)
+    seen = []
     for i in range(task.max_steps):
         seen.append(np.asarray(obs)[active])
         action = np.asarray(act(np.asarray(obs))).astype(dtype)
@@ -270,24 +273,19 @@ def _stepper(task: Task) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def fit(
-    config: CopyConfig,
-    task: Task,
-    states: np.ndarray,
-    actions: np.ndarray,
-    scale: tuple[np.ndarray, np.ndarray],
-    key: Array,
+    config: CopyConfig, task: Task, obs: np.ndarray, actions: np.ndarray, scale: Scale, key: Array
 ) -> list[Layer]:
     """A copy that is fitted to a policy's actions in some states.
 
     The loss is the squared error after clipping for continuous actions, the cross-entropy for
-    discrete actions. The `scale` is the mean and the deviation that whiten states.
+    discrete actions.
     """
     is_discrete = task.num_actions is not None
     mean, std = scale
-    inputs = jnp.asarray((states - mean) / std, jnp.float32)
+    inputs = jnp.asarray((obs - mean) / std, jnp.float32)
     targets = jnp.asarray(actions / task.max_action, jnp.int32 if is_discrete else jnp.float32)
     key_init, key_fit = jax.random.split(key)
-    sizes = [task.obs_dim, *[config.hidden_size] * (config.hidden_size > 0), task.action_dim]
+    sizes = [n for n in (task.obs_dim, config.hidden_size, task.action_dim) if n > 0]
     keys = jax.random.split(key_init, len(sizes) - 1)
     params = []
     for k, (n_in, n_out) in zip(keys, itertools.pairwise(sizes), strict=True):

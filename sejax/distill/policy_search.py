@@ -78,8 +78,8 @@ class PolicySearchConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        most, got = self.num_directions, self.num_top
-        require(got <= most, "search.num_top", "must fit num_directions", got=got, use=most)
+        limit, top = self.num_directions, self.num_top
+        require(top <= limit, "search.num_top", "must fit num_directions", got=top, use=limit)
 
 
 class Policy(NamedTuple):
@@ -159,7 +159,8 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
     """
     require_vectors(task)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
-    shape, num_episodes = (task.action_dim, task.obs_dim + 1), 2 * config.num_directions
+    shape = (task.action_dim, task.obs_dim + 1)
+    num_episodes = 2 * config.num_directions
     play, record_one = make_tester(agent, task, 1), make_recorder(agent, task, 1)
 
     def init() -> Policy:
@@ -272,7 +273,8 @@ def search_policies(
 
     def climb(start: int, first: int, policy: Policy) -> Arrays:
         """The policy after the generations from `first` up to its next test, and its row."""
-        started, num_steps = time.process_time(), 0
+        started = time.process_time()
+        num_steps = 0
         last = min(first + config.test_every, config.generations)
         key_search, key_test = (jax.random.fold_in(keys[use], start) for use in ("search", "test"))
         for number in range(first, last):
@@ -280,10 +282,11 @@ def search_policies(
             policy, _, num_taken = search.generation(key, policy, number)
             num_steps += int(num_taken)
         tests = search.test(jax.random.fold_in(key_test, last), policy)
+        num_steps += int(tests.num_steps.sum())
         mean, std = float(tests.returns.mean()), float(tests.returns.std())
-        real_steps, cpu_s = num_steps + int(tests.num_steps.sum()), time.process_time() - started
+        cpu_s = time.process_time() - started
         print(f"start {start}, generation {last}: policy {mean:.1f} ± {std:.1f}", flush=True)
-        row = dict(zip(COLUMNS, (start, last, mean, std, real_steps, cpu_s), strict=True))
+        row = dict(zip(COLUMNS, (start, last, mean, std, num_steps, cpu_s), strict=True))
         return {name: np.asarray(value) for name, value in (policy._asdict() | row).items()}
 
     def advance(start: int, firsts: Sequence[int], policy: Policy) -> Policy:
@@ -301,27 +304,27 @@ def search_policies(
     ends = [advance(i, firsts[:num_tried], search.init()) for i in range(config.num_starts)]
     best = int(max(rows, key=_test_mean)["start"])
     advance(best, firsts[num_tried:], ends[best])
-    went_on = [row for row in rows if row["start"] == best]
-    parts = np.array_split(np.arange(len(went_on)), min(num_lessons, len(went_on)))
-    chosen = [max((went_on[i] for i in part), key=_test_mean) for part in parts]
-    lessons = [_lesson(config, search, task, keys["record"], row) for row in chosen]
+    continued = np.array([row for row in rows if row["start"] == best])
+    parts = np.array_split(continued, min(num_lessons, len(continued)))
+    chosen = [max(part, key=_test_mean) for part in parts]
+    lessons = [_lesson(config.num_tests, search, task, keys["record"], row) for row in chosen]
     return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])
 
 
-def _lesson(
-    config: PolicySearchConfig, search: Search, task: Task, key: Array, row: Arrays
-) -> Lesson:
+def _lesson(num_tests: int, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:
     """A tested policy, with the states that it visits in new episodes, as the tests chose it.
 
     The cost of the new episodes is added to the row.
     """
-    started, generation = time.process_time(), int(row["generation"])
+    started = time.process_time()
+    generation = int(row["generation"])
     policy = _policy_of(row)
     seen = jax.device_get(search.record(jax.random.fold_in(key, generation), policy))
-    states, total = seen.obs[seen.valid], float(seen.reward[seen.valid].sum())
+    states = seen.obs[seen.valid]
+    policy_return = float(seen.reward[seen.valid].sum()) / num_tests
     row["real_steps"] = row["real_steps"] + len(states)
     row["cpu_s"] = row["cpu_s"] + time.process_time() - started
-    return Lesson(generation, policy.layers(task.max_action), states, total / config.num_tests)
+    return Lesson(generation, policy.layers(task.max_action), states, policy_return)
 
 
 def _policy_of(tested: Arrays) -> Policy:

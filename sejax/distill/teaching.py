@@ -44,9 +44,8 @@ def students(
     """
     # The weights name the entry: the policy behind the name in `policy` may have changed.
     taught_by = fingerprint({str(i): weights for i, (_, weights) in enumerate(ses)})
-    names = ("generation", "policy_return", "agent", "student")
     lines = [(x.generation, x.policy_return, "", i) for x in lessons for i in range(len(keys))]
-    rows = pd.DataFrame(lines, columns=names)
+    rows = pd.DataFrame(lines, columns=["generation", "policy_return", "agent", "student"])
     tables = []
     for key in config.agents:
         agent = config.agent_for(key, ses[0][0].task, is_varied=False)
@@ -72,7 +71,8 @@ def teach(ses: Sequence[SE], agent: Agent, config: CommandConfig, keys: Array) -
       By name, `[se * student]` each: `test_return`, the mean over test episodes, nan for a student
       that diverged; `train_steps`; `real_steps`; `cpu_s`, the mean CPU seconds of a student.
     """
-    started, env = time.process_time(), ses[0][0]
+    started = time.process_time()
+    env, _ = ses[0]
     print(f"training {len(ses) * len(keys)} students ...", flush=True)
     counts = {"devices": config.devices, "num_parallel": config.num_parallel}
     outcomes = [
