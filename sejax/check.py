@@ -132,11 +132,11 @@ def findings(config: CheckConfig) -> dict[str, Any]:
     others = _others(config, task)
     students = learned | others
     myopic = {}  # keys of agents, by row
-    # In one step a discount has no effect.
-    for discount in DISCOUNTS if proxy.env.max_steps > 1 else ():
-        of_row = {f"{key}-{discount:g}": agent for key, agent in learned.items()}
-        students |= {k: dataclasses.replace(x, discount=discount) for k, x in of_row.items()}
-        myopic[MYOPIC.format(discount)] = list(of_row)
+    if proxy.env.max_steps > 1:  # in one step a discount has no effect
+        for discount in DISCOUNTS:
+            of_row = {f"{key}-{discount:g}": agent for key, agent in learned.items()}
+            students |= {k: dataclasses.replace(x, discount=discount) for k, x in of_row.items()}
+            myopic[MYOPIC.format(discount)] = list(of_row)
     worlds = fresh_agents.worlds_of(dataclasses.replace(config, agents=students)).values()
     on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
     tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"

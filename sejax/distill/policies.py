@@ -91,7 +91,7 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
 def _checked(act: Actor, task: Task) -> Actor:
     """The policy, with checks of its actions."""
     count = task.num_actions
-    must = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
+    expected = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
 
     def checked(obs: np.ndarray) -> np.ndarray:
         shape = (len(obs), task.action_dim) if count is None else (len(obs),)
@@ -103,7 +103,7 @@ def _checked(act: Actor, task: Task) -> Actor:
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
         got = f"{list(actions.shape)}, such as {actions.ravel()[:3]}"
         is_fit = actions.shape == shape and known.all()
-        require(is_fit, "policy", f"must give {must} of the shape {list(shape)}", got=got)
+        require(is_fit, "policy", f"must give {expected} of the shape {list(shape)}", got=got)
         return actions
 
     return checked
@@ -117,8 +117,8 @@ def _of_sb3(text: str, task: Task) -> Actor:
         model = getattr(stable_baselines3, name.upper()).load(path, device="cpu")
     except Exception as error:  # of any kind: the file, the algorithm or the library
         got = f"{shortened(text)} ({options.told(error)}). It needs pip install '.[sb3]'"
-        must = f"must be a model that its algorithm saved; got {got}"
-        raise options.ConfigError("policy", must, fix=FIX) from error
+        rule = f"must be a model that its algorithm saved; got {got}"
+        raise options.ConfigError("policy", rule, fix=FIX) from error
     # sejax scales actions to [-1, 1] if their bounds differ between dimensions.
     space = model.action_space
     is_discrete = task.num_actions is not None

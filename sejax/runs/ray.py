@@ -89,8 +89,8 @@ class RayConfig(MachinesConfig):
                 warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
                 ray.init(self.address, **quiet)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            must = f"must be within reach; got {self.address} ({told(error)})"
-            raise ConfigError("machines.address", must, use="local") from error
+            rule = f"must be within reach; got {self.address} ({told(error)})"
+            raise ConfigError("machines.address", rule, use="local") from error
         try:
             yield functools.partial(_on_cluster, self)
         finally:
@@ -154,7 +154,7 @@ class RemoteChunks(Chunks):
 
         state = jax.eval_shape(bilevel.init, jax.random.key(0))
         shapes = jax.eval_shape(evaluate, state)
-        no_outcomes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        no_outcomes = jax.tree.map(jnp.zeros_like, shapes)
         jitted = jax.jit(generation, compiler_options=compiler_options())
         return jitted.lower(state, no_outcomes).compile(), no_outcomes
 

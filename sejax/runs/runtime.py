@@ -33,8 +33,8 @@ def platform_error() -> str:
         try:
             jax.devices()
         except (RuntimeError, AssertionError):
-            must = "must name what jax was installed for and finds here"
-            return f"JAX_PLATFORMS {must}; got {platforms}. Set JAX_PLATFORMS=cpu."
+            rule = "must name what jax was installed for and finds here"
+            return f"JAX_PLATFORMS {rule}; got {platforms}. Set JAX_PLATFORMS=cpu."
     return ""
 
 

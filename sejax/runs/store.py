@@ -76,8 +76,8 @@ class Store:
         except (OSError, ValueError, NotImplementedError) as error:
             is_used = isinstance(error, filelock.Timeout)
             why = "which another process uses" if is_used else shortened(error)
-            must = "must be a folder that can be written"
-            raise self.refused(f"{must}; got {shortened(self.folder)}, {why}") from error
+            rule = "must be a folder that can be written"
+            raise self.refused(f"{rule}; got {shortened(self.folder)}, {why}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -115,12 +115,10 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self.damaged(name, error) from error
         self._has_entry = True
-        differing = differences(stored, self.settings, self._free)
+        differing = differences(self.completed(stored), self.settings, self._free)
         if differing:
-            differing = differences(self.completed(stored), self.settings, self._free)
-        if differing:
-            must = "must be new or made with the same settings"
-            raise self.refused(f"{must}; got {self.folder}, which differs in {differing}")
+            rule = "must be new or made with the same settings"
+            raise self.refused(f"{rule}; got {self.folder}, which differs in {differing}")
         return tensors, values
 
     def put(self, name: str, tensors: Tensors | None = None, **values: object) -> None:

@@ -36,8 +36,8 @@ def main(overrides: Sequence[str]) -> None:
         study.report(current, plan)
     except study.UNUSABLE as error:
         got = f"{plan.folder / 'study.db'} ({told(error.__cause__ or error)})"
-        must = f"must hold a database that can be used; got {got}"
-        raise ConfigError("search_dir", must, use="FOLDER") from error
+        rule = f"must hold a database that can be used; got {got}"
+        raise ConfigError("search_dir", rule, use="FOLDER") from error
 
 
 def help_text(overrides: Sequence[str]) -> str:

@@ -55,8 +55,8 @@ class StudyConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = self.min_generations, self.max_generations
-        must = "must be at least min_generations"
-        require(high >= low, "max_generations", must, got=high, use=9 * low)
+        rule = "must be at least min_generations"
+        require(high >= low, "max_generations", rule, got=high, use=9 * low)
 
     @property
     def rungs(self) -> list[int]:
@@ -131,16 +131,16 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     texts = {name: by_name[name].partition("=")[2] for name in of_run}
     ranges = {name: text for name, text in texts.items() if spaces.is_range(text)}
     others = texts_of([x for name, x in by_name.items() if name not in ranges])
-    own = {name: others.pop(name) for name in [*others] if name.partition(".")[0] in known}
+    of_study = {name: others.pop(name) for name in [*others] if name.partition(".")[0] in known}
     for name, text in ranges.items():
         require(name not in ONE_VALUE, name, "must be one value in a search", got=text, use="VALUE")
     for name, text in (ranges | others).items():
-        must = "must be left out, as the search sets it"
+        rule = "must be left out, as the search sets it"
         fix = "Set max_generations, seeds or search_dir, or type the command again for a worker."
-        require(name.partition(".")[0] not in SET_BY_SEARCH, name, must, got=text, fix=fix)
+        require(name.partition(".")[0] not in SET_BY_SEARCH, name, rule, got=text, fix=fix)
     space = {name: spaces.parse(name, text) for name, text in ranges.items()}
     fixed = tuple(f"{name}={text}" for name, text in others.items())
-    plan = StudyPlan(config=from_plain(StudyConfig, own, ""), fixed=fixed, space=space)
+    plan = StudyPlan(config=from_plain(StudyConfig, of_study, ""), fixed=fixed, space=space)
     default = plan.default
     if plan.config.space is not None:
         by_key = default.agents.items()
@@ -156,6 +156,6 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
         is_fit = type(fields[name]) is not int or not isinstance(x.distribution, FloatDistribution)
         use = f"'{x.text.replace('interval(', 'int(interval(').replace(')', '))', 1)}'"
         require(is_fit, name, "must be whole numbers", got=x.text, use=use)
-    must = "must be given and have ranges for these agents, or fields must have some; got none"
-    require(space, "space", must, use=f"paper_se, or es.noise_std='{spaces.EXAMPLE}'")
+    rule = "must be given and have ranges for these agents, or fields must have some; got none"
+    require(space, "space", rule, use=f"paper_se, or es.noise_std='{spaces.EXAMPLE}'")
     return plan

@@ -98,8 +98,8 @@ def parse(name: str, text: str) -> Dimension:
     try:
         distribution = _distribution(call, tags)
     except (LookupError, TypeError, ValueError, ZeroDivisionError) as error:  # also of Optuna
-        must = f"must be a choice, a range or an interval; got {shortened(text)} ({told(error)})"
-        raise ConfigError(name, must, use=f"'{EXAMPLE}'") from error
+        rule = f"must be a choice, a range or an interval; got {shortened(text)} ({told(error)})"
+        raise ConfigError(name, rule, use=f"'{EXAMPLE}'") from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
 
 
@@ -150,9 +150,9 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
                     texts[field.replace("agent", group, 1)] = text
     except UNREADABLE as error:
         known = nearest(name, (file.stem for file in FOLDER.glob("*.yaml")))
-        must = f"must be one of {', '.join(known)}, or a YAML file of ranges"
+        rule = f"must be one of {', '.join(known)}, or a YAML file of ranges"
         got = f"{shortened(name)} ({told(error)[:120]})"
-        raise ConfigError("space", f"{must}; got {got}", use="paper_se") from error
+        raise ConfigError("space", f"{rule}; got {got}", use="paper_se") from error
     foreign = [text for text in texts.values() if ":" in str(text)]
     fix = "Type this range on the command line."
     require(not foreign, "space", "must name no module", got=", ".join(map(str, foreign)), fix=fix)
