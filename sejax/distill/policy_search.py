@@ -304,11 +304,15 @@ def search_policies(
     ends = [advance(i, firsts[:num_tried], search.init()) for i in range(config.num_starts)]
     best = int(max(rows, key=_test_mean)["start"])
     advance(best, firsts[num_tried:], ends[best])
-    continued = np.array([row for row in rows if row["start"] == best])
-    parts = np.array_split(continued, min(num_lessons, len(continued)))
-    chosen = [max(part, key=_test_mean) for part in parts]
+    chosen = _best_of_parts([row for row in rows if row["start"] == best], num_lessons)
     lessons = [_lesson(config.num_tests, search, task, keys["record"], row) for row in chosen]
     return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])
+
+
+def _best_of_parts(rows: Sequence[Arrays], num_parts: int) -> list[Arrays]:
+    """The best tested policy of each of several equal parts of a search."""
+    parts = np.array_split(np.array(rows), min(num_parts, len(rows)))
+    return [max(part, key=_test_mean) for part in parts]
 
 
 def _lesson(num_tests: int, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:

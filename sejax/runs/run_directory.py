@@ -30,8 +30,7 @@ COLUMNS = (
 # Columns that a mixture also has for each agent, with the agent's name at the end.
 AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
 
-_CHECKPOINT = "checkpoint"  # the name of the store's entry
-_METRICS, _CONFIG = "metrics.csv", "config.yaml"
+_CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
 # A killed session may leave temporaries of these files.
 _WRITTEN = ("*.safetensors", _METRICS, _CONFIG, "learning_curve.png", "run.json")
