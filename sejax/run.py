@@ -12,7 +12,6 @@ Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
 import contextlib
-import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,14 +40,7 @@ help_text = functools.partial(commands.help_of, LearnConfig, __doc__)
 
 def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
     """The configuration of each run that the overrides describe, with folders of their own."""
-    runs: list[LearnConfig] = []
-    for config in LearnConfig.of_sweep(overrides):
-        for seed in range(config.seed, config.seed + config.num_seeds):
-            folder = config.run_dir
-            if folder and config.num_seeds > 1:
-                folder = f"{folder}/seed{seed}"
-            runs.append(dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=folder))
-    return without_repetitions(runs)
+    return without_repetitions(LearnConfig.of_sweep(overrides))
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:

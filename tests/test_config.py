@@ -134,15 +134,14 @@ def test_commas_outside_of_brackets_and_quotes_make_a_sweep():
 
 
 def test_the_runs_of_a_sweep_have_folders_of_their_own():
-    configs = run.configs_of(["seed=0,1", "es.noise_std=0.03,0.06", "num_seeds=2"])
+    configs = run.configs_of(["seed=0,1", "es.noise_std=0.03,0.06"])
     folders = {str(config.folder) for config in configs}
-    assert len(folders) == 8 and all("noise_std" in folder for folder in folders)
+    assert len(folders) == 4 and all("noise_std" in folder for folder in folders)
     configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
     configs = run.configs_of(["run_dir=", "seed=0,1"])  # an empty variable of a shell
     assert {x.folder.name for x in configs} == {f"cartpole-se-ddqn-s{i}" for i in (0, 1)}
-    assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2", "num_seeds=2"])] == [2, 3]
-    assert [x.seed for x in run.configs_of(["seed=0,1", "num_seeds=2"])] == [0, 1, 2]
+    assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2,3"])] == [2, 3]
     folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
     assert folders[1] == "runs/evaluate-cartpole_seed_2" and len({*folders}) == 4
     (folder, _) = evaluate.configs_of(["proxy=real", "env=acrobot", "seed=1,2"])
@@ -235,7 +234,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
      ""), ("training.max_steps=null training.max_episodes=1", "training.max_episodes", "=4"),
     ("agent=ppo proxy.horizon=null training.max_steps=100", "training.max_steps", "max_steps=512"),
     ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
-    ("seeds=4", "seeds", "num_seeds?"), ("es.mirrored=yes", "es.mirrored", "be true or false"),
+    ("num_seeds=4", "num_seeds", "mean seed?"), ("es.mirrored=yes", "es.mirrored", "be true or "),
     ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", "any more"),
 ])  # fmt: skip
 def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(

@@ -116,22 +116,22 @@ def test_seeds_run_one_after_the_other_on_one_executable(
 ):
     compiled, compile_ = [], Chunks.compile
     monkeypatch.setattr(Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n)))
-    words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
+    words = ["generations=6", "checkpoint_every=2", "seed=12,13", f"run_dir={tmp_path}"]
     best = run.learn_all(run.configs_of([*TINY, *words]))
     assert compiled == [2]
     said = capsys.readouterr().out
     assert all(
-        f"{tmp_path}/seed{seed}" in said.split("Best scores of the search mean:")[1]
+        f"{tmp_path}/seed_{seed}" in said.split("Best scores of the search mean:")[1]
         for seed in (12, 13)
     )
-    assert {path.name for path in tmp_path.iterdir()} == {"seed12", "seed13"}
+    assert {path.name for path in tmp_path.iterdir()} == {"seed_12", "seed_13"}
     for seed, score in zip((12, 13), best, strict=True):
-        folder = tmp_path / f"seed{seed}"
+        folder = tmp_path / f"seed_{seed}"
         assert {path.name for path in folder.iterdir()} == FILES
         assert {row["seed"] for row in rows(folder)} == {str(seed)}
         record = sejax.load_proxy(folder).record
         assert record["seed"] == seed and record["score"] == pytest.approx(score)
-    assert rows(tmp_path / "seed12") == rows(uninterrupted)
+    assert rows(tmp_path / "seed_12") == rows(uninterrupted)
 
 
 # --- trackers ------------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ def main() -> None:
 def save(path: Path, proxy: sejax.Proxy, **more: object) -> None:
     """Writes a proxy with more in its record."""
     record = {**proxy.record, **more}
-    config = {**proxy.config, "seed": record.get("seed"), "num_seeds": 1}
+    config = {**proxy.config, "seed": record.get("seed")}
     sejax.save(path, proxy.env, proxy.params.weights, config, proxy.discount, **record)
 
 
@@ -77,7 +77,7 @@ def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
     elif curves.exists():
         learned = LearnConfig.of_stored(proxy.config)  # with the names of today
         config = json.loads(json.dumps(learned.plain()))
-        config |= {"seed": proxy.record["seed"], "num_seeds": 1}
+        config["seed"] = proxy.record["seed"]
         rows = pd.read_csv(curves).query("variant == @path.stem and seed == @config['seed']")
         costs = {"generations": len(rows), "real_steps": int(rows["env_steps_total"].max())}
     else:

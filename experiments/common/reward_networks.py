@@ -266,7 +266,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     counted = {"generations", "stop_when_solved"}
-    free = {*config.free} - counted | {"num_parallel", "num_seeds"}
+    free = {*config.free} - counted | {"num_parallel"}
     flat = flatten(config.plain())
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 

@@ -67,7 +67,7 @@ class RunSettings(Settings):
 def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
     """Configurations of runs with the seeds from `config.seed` on, in folders of their own."""
     return [
-        dataclasses.replace(config, seed=seed, num_seeds=1, run_dir=str(folder / f"seed{seed}"))
+        dataclasses.replace(config, seed=seed, run_dir=str(folder / f"seed{seed}"))
         for seed in range(config.seed, config.seed + num_runs)
     ]
 

@@ -9,7 +9,7 @@ from sejax.options import registry
 GONE: dict[str, object] = {"agent.torso": None, "agent.num_filters": 16, "agent.loss": "squared"}
 GONE |= {f"agent.{x}": 1 for x in ("train_every", "gradient_steps", "target_update_every")}
 GONE |= {"baseline": True, "agent.noisy_tests": False, "mixture.compared_by": "advantage"}
-GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True}
+GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True, "num_seeds": 1}
 
 
 def of_today(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ T = typing.TypeVar("T")
 MISSING = dataclasses.MISSING
 NAMED = 2  # fields of a message about settings that differ
 # Our names of fields, by the names that others use.
-SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "seeds": "num_seeds"}
+SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "num_seeds": "seed"}
 # Last parts of the names of fields whose text may be a `module:attribute`, or code's address.
 NAMES_CODE = ("name", "env", "policy", "proxy_kind", "score_transform", "algorithms", "address")
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
@@ -175,7 +175,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     usual = SYMBOLS.get(last, last)
     ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    is_gone = any(x.endswith(f".{last}") for x in old.GONE)
+    is_gone = last in {name.rpartition(".")[2] for name in old.GONE}
     rule = "is no field any more" if is_gone else "is no field"
     return ConfigError(field, rule, fix=f"{fix}Fields: {listed(ranked)}.")
 

@@ -62,7 +62,6 @@ class LearnConfig(CommandConfig):
       agent_hparams: default: the agent's; varied: learning rate, batch and network are drawn for
         each training.
       generations: n_o: steps of the outer loop.
-      num_seeds: Independent runs, with seeds seed, seed + 1, ...
       stop_when_solved: End a run when the search mean first reaches the solved score.
       checkpoint_every: generations between checkpoints
       run_dir: null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
@@ -85,7 +84,6 @@ class LearnConfig(CommandConfig):
     machines: MachinesConfig = plugin("machines")
     agent_hparams: Literal["default", "varied"] = "default"
     generations: Count = 100
-    num_seeds: Count = 1
     stop_when_solved: bool = False
     checkpoint_every: Count = 1
     run_dir: str | None = None
