@@ -69,7 +69,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     assert proxy.learned_agents() == {"q_learning": sejax.QLearningConfig(discount=0.7)}
     assert refused(proxy.learned_with, "training") == "group"
     own = {"agents": {"mine": {"name": "my:Agent", "weight": 3}}}  # an own agent's own field
-    assert old.of_today(own) == own
+    assert old.upgraded(own) == own
 
 
 def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):

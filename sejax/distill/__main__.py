@@ -90,7 +90,7 @@ class DistillConfig(CommandConfig):
             self.require_learning(key, "training", self.training, ONE_STEP, spec)
 
     @classmethod
-    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
+    def default_layers(cls, typed: Tree) -> dict[str, Tree]:
         """The settings of a run with this preset that are fields here, and those of the task.
 
         One-step SEs have trainings and students of their own. Searches leave out the task's reward
@@ -107,7 +107,7 @@ class DistillConfig(CommandConfig):
         steps = flatten(typed).get("training.max_steps", STEPS[actions])
         lengths = {"max_steps": steps, "max_episodes": steps}
         search = {"alive_bonus": getattr(env, "healthy_reward", 0.0)}
-        of_run = LearnConfig.layers_below(typed)
+        of_run = LearnConfig.default_layers(typed)
         below = {layer: {k: tree[k] for k in known if k in tree} for layer, tree in of_run.items()}
         return below | {"distill": {"training": lengths, "search": search}}
 

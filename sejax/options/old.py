@@ -12,7 +12,7 @@ GONE |= {"baseline": True, "agent.noisy_tests": False, "mixture.compared_by": "a
 GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True, "num_seeds": 1}
 
 
-def of_today(config: Mapping[str, Any]) -> dict[str, Any]:
+def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration in the form in which files are written today.
 
     Older versions wrote an only agent as `agent`, and the settings of a mixture among its agents.

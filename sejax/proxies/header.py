@@ -57,7 +57,7 @@ class Header:
     proxies: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        config = old.of_today(self.config)
+        config = old.upgraded(self.config)
         object.__setattr__(self, "config", config)
         explored = config.get("exploration", {"name": "none"})
         parts = [config["env"], config["proxy"], *config["agents"].values(), explored]

@@ -89,7 +89,7 @@ class CommandConfig(Options, ABC):
 
     @classmethod
     @abstractmethod
-    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
+    def default_layers(cls, typed: Tree) -> dict[str, Tree]:
         """The layers below a user's words, by their names; each lies over those before it.
 
         Args:
@@ -150,7 +150,7 @@ class CommandConfig(Options, ABC):
         typed = merge(*trees)
         code = code_in(trees[-1]).values()
         require_typed(typed, code)
-        layers = cls.layers_below(typed)
+        layers = cls.default_layers(typed)
         below = merge(*layers.values())
         require_typed(below, code)
         agent_names = names_of(below["agents"])

@@ -122,7 +122,7 @@ class LearnConfig(CommandConfig):
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
         """
         require_typed(values, typed)
-        return cls.of_tree(old.of_today(values))
+        return cls.of_tree(old.upgraded(values))
 
     def name(self, group: str) -> str:
         """The name of a group's choice; of agents their keys, as `ddqn+ppo`."""
@@ -158,7 +158,7 @@ class LearnConfig(CommandConfig):
         }
 
     @classmethod
-    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
+    def default_layers(cls, typed: Tree) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
         agent_names = names_of(typed["agents"])
         if not agent_names:

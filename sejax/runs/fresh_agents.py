@@ -71,7 +71,7 @@ class FreshAgentsConfig(CommandConfig):
     real_training: TrainingConfig = REAL_TRAINING
 
     @classmethod
-    def layers_below(cls, typed: Tree) -> dict[str, Tree]:
+    def default_layers(cls, typed: Tree) -> dict[str, Tree]:
         """What agents take from the run that learned the proxy.
 
         If no word names an agent, all of the proxy's agents train, with their exploration and the

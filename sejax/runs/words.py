@@ -89,7 +89,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
     path = Path(expanded(texts.pop("preset")))
     typed = _tree(texts, groups)
     try:
-        values = flatten(old.of_today(yaml.safe_load(path.read_text(encoding="utf-8"))))
+        values = flatten(old.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         for group in groups:  # fields of a choice that a typed one replaces
             name = typed.get(group, {}).get("name")
@@ -113,7 +113,7 @@ def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
         for part in reversed([*name.split("."), *(["name"] if is_choice else [])]):
             value = {part: value}
         tree = merge(tree, value)
-    return old.of_today(tree)
+    return old.upgraded(tree)
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
