@@ -50,18 +50,14 @@ class OffPolicyOptions(AgentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        most, got = self.buffer_size, self.batch_size
-        require(got <= most, "agent.batch_size", "must fit buffer_size", got=got, use=most)
+        size = self.batch_size
+        most = self.buffer_size
+        require(size <= most, "agent.batch_size", "must fit buffer_size", got=size, use=most)
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
-        return MLP(
-            num_outputs=num_outputs,
-            hidden_size=self.hidden_size,
-            num_layers=self.num_layers,
-            activation=self.activation,
-            learn_prelu_slope=True,
-        )
+        hidden = (self.hidden_size, self.num_layers, self.activation)
+        return MLP(num_outputs, *hidden, learn_prelu_slope=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,23 +85,36 @@ class OffPolicy(Algorithm):
         return replay_buffer(self.config.batch_size, self.config.buffer_size)
 
 
+@dataclass(eq=False)
 class ActorCritic(OffPolicy):
-    """An off-policy agent that acts at random while its state's `is_warming_up` is set."""
+    """An off-policy agent that acts at random while its state's `is_warming_up` is set.
 
+    Args:
+      config: hyperparameters.
+      obs_dim: length of an observation.
+      action_dim: length of an action, or the number of discrete actions.
+      max_action: the largest continuous action.
+    """
+
+    config: ActorCriticOptions
     obs_dim: int
-    actor: MLP
-    critic: MLP
+    action_dim: int
+    max_action: float = 1.0
 
-    def init_networks(self, key: Array, hparams: Hparams, num_actions: int) -> tuple[Any, Any]:
-        """Parameters of the actor, and of two critics, `[2, ...]`.
+    def __post_init__(self) -> None:
+        num_outputs, self.num_action_inputs, num_values = self.sizes()
+        self.actor = self.config.mlp(num_outputs)
+        self.critic = self.config.mlp(num_values)
 
-        Args:
-          key: for both.
-          hparams: with the units in use.
-          num_actions: actions among the critics' inputs.
-        """
+    def sizes(self) -> tuple[int, int, int]:
+        """Outputs of the actor, inputs of a critic beside the observation, and its outputs."""
+        return self.action_dim, self.action_dim, 1
+
+    def init_networks(self, key: Array, hparams: Hparams) -> tuple[Any, Any]:
+        """Parameters of the actor, and of two critics, `[2, ...]`."""
         key_actor, key_critics = jax.random.split(key)
-        num_inputs, size = self.obs_dim + num_actions, hparams.hidden_size
+        num_inputs = self.obs_dim + self.num_action_inputs
+        size = hparams.hidden_size
         init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
         actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
         return actor, init_critics(jax.random.split(key_critics))

@@ -7,9 +7,7 @@ Source: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018);
 "Soft Actor-Critic for Discrete Action Settings" (2019).
 """
 
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, cast
 
@@ -63,9 +61,8 @@ class SACConfig(ActorCriticOptions):
         unused = "target_entropy_fraction" if task.num_actions is None else "target_entropy"
         is_default = getattr(self, unused) == getattr(type(self), unused)
         require(is_default, f"agent.{unused}", f"must be left out for {task.name}'s actions.")
-        if task.num_actions is None:
-            return SAC(self, task.obs_dim, task.action_dim, task.max_action).agent()
-        return DiscreteSAC(self, task.obs_dim, task.num_actions).agent()
+        algorithm = SAC if task.num_actions is None else DiscreteSAC
+        return algorithm(self, task.obs_dim, task.action_dim, task.max_action).agent()
 
 
 class SACState(struct.PyTreeNode):
@@ -88,10 +85,6 @@ class LearningNoise(NamedTuple):
 
     next_action: Array | None
     action: Array | None
-
-
-# `inputs [in, batch] -> [2, out, batch]`, both critics with some parameters.
-Critics = Callable[[Array], Array]
 
 
 class Params(NamedTuple):
@@ -117,19 +110,9 @@ class SAC(ActorCritic):
 
     config: SACConfig
 
-    def __init__(self, config: SACConfig, obs_dim: int, action_dim: int, max_action: float = 1.0):
-        self.config, self.obs_dim = config, obs_dim
-        self.action_dim, self.max_action = action_dim, max_action
-        num_outputs, self.action_inputs, num_values = self.sizes()
-        self.actor, self.critic = config.mlp(num_outputs), config.mlp(num_values)
-        self.critics = jax.vmap(self.critic.apply, (0, None))
-
-    def init_params(self, key: Array, hparams: Hparams) -> Params:
-        actor, critics = self.init_networks(key, hparams, self.action_inputs)
-        return Params(actor, critics, log_alpha=jnp.log(jnp.float32(hparams.init_alpha)))
-
     def init(self, key: Array, hparams: Hparams) -> SACState:
-        params = self.init_params(key, hparams)
+        actor, critics = self.init_networks(key, hparams)
+        params = Params(actor, critics, log_alpha=jnp.log(jnp.float32(hparams.init_alpha)))
         return SACState(
             params=params,
             target_critics=params.critics,
@@ -141,6 +124,10 @@ class SAC(ActorCritic):
     def outputs(self, params: Params, obs: Array) -> Array:
         """The actor's, `[num_outputs, *batch]`."""
         return cast(Array, self.actor.apply(params.actor, obs))
+
+    def critic_outputs(self, critics: PyTree, inputs: Array) -> Float[Array, "2 outputs *batch"]:
+        """Both critics' outputs."""
+        return cast(Array, jax.vmap(self.critic.apply, (0, None))(critics, inputs))
 
     def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
         outputs = self.outputs(state.params, obs)
@@ -184,19 +171,17 @@ class SAC(ActorCritic):
 
         Source: Haarnoja et al. (2018), eq. 5, 7 and 18; Christodoulou (2019), eq. 10 to 12.
         """
-        hp, fixed = state.hparams, jax.lax.stop_gradient(params)
-        online, online_fixed, target = (
-            functools.partial(self.critics, critics)
-            for critics in (params.critics, fixed.critics, state.target_critics)
-        )
+        hp = state.hparams
+        fixed = jax.lax.stop_gradient(params)
         alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
+        next_outputs = self.outputs(fixed, batch.next_obs)
         next_q, next_entropy = self.expected(
-            target, batch.next_obs, self.outputs(fixed, batch.next_obs), noise.next_action
+            state.target_critics, batch.next_obs, next_outputs, noise.next_action
         )
         targets = batch.reward + hp.discount * batch.discount * (next_q + alpha * next_entropy)
-        errors = self.q_values(online, batch.obs, batch.action) - targets
+        errors = self.q_values(params.critics, batch.obs, batch.action) - targets
         q_value, entropy = self.expected(
-            online_fixed, batch.obs, self.outputs(params, batch.obs), noise.action
+            fixed.critics, batch.obs, self.outputs(params, batch.obs), noise.action
         )
         losses = 0.5 * jnp.sum(errors**2, axis=0) - (q_value + alpha * entropy)
         if hp.alpha is None:
@@ -207,7 +192,6 @@ class SAC(ActorCritic):
     # Methods that discrete actions override.
 
     def sizes(self) -> tuple[int, int, int]:
-        """Outputs of the actor, inputs of a critic beside the observation, and its outputs."""
         return 2 * self.action_dim, self.action_dim, 1
 
     def target_entropy(self, hparams: Hparams) -> Array:
@@ -228,12 +212,12 @@ class SAC(ActorCritic):
         """The action without any randomness."""
         return jnp.tanh(outputs[: self.action_dim])
 
-    def q_values(self, critics: Critics, obs: Array, action: Array) -> Float[Array, "2 batch"]:
+    def q_values(self, critics: PyTree, obs: Array, action: Array) -> Float[Array, "2 batch"]:
         """Both critics' values of the actions that were taken."""
-        return critics(jnp.concatenate([obs, action]))[:, 0]
+        return self.critic_outputs(critics, jnp.concatenate([obs, action]))[:, 0]
 
     def expected(
-        self, critics: Critics, obs: Array, outputs: Array, noise: Array | None
+        self, critics: PyTree, obs: Array, outputs: Array, noise: Array | None
     ) -> tuple[Array, Array]:
         """The lesser critic's value and the entropy, `[batch]` each, for an action drawn by noise.
 
@@ -270,15 +254,16 @@ class DiscreteSAC(SAC):
     def best(self, outputs: Array) -> Array:
         return jnp.argmax(outputs).astype(jnp.int32)
 
-    def q_values(self, critics: Critics, obs: Array, action: Array) -> Float[Array, "2 batch"]:
-        return jax.vmap(select_action, (0, None))(critics(obs), action)
+    def q_values(self, critics: PyTree, obs: Array, action: Array) -> Float[Array, "2 batch"]:
+        return jax.vmap(select_action, (0, None))(self.critic_outputs(critics, obs), action)
 
     def expected(
-        self, critics: Critics, obs: Array, outputs: Array, noise: Array | None
+        self, critics: PyTree, obs: Array, outputs: Array, noise: Array | None
     ) -> tuple[Array, Array]:
         log_p = jax.nn.log_softmax(outputs, axis=0)
         p = jnp.exp(log_p)
-        return jnp.sum(p * lesser(critics(obs)), axis=0), -jnp.sum(p * log_p, axis=0)
+        q_values = lesser(self.critic_outputs(critics, obs))
+        return jnp.sum(p * q_values, axis=0), -jnp.sum(p * log_p, axis=0)
 
     def env_action(self, action: Array) -> Array:
         return action

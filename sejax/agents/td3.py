@@ -132,13 +132,8 @@ class TD3(ActorCritic):
 
     config: TD3Config
 
-    def __init__(self, config: TD3Config, obs_dim: int, action_dim: int, max_action: float):
-        self.config, self.obs_dim = config, obs_dim
-        self.action_dim, self.max_action = action_dim, max_action
-        self.actor, self.critic = config.mlp(action_dim), config.mlp(1)
-
     def init(self, key: Array, hparams: Hparams) -> TD3State:
-        actor, critics = self.init_networks(key, hparams, self.action_dim)
+        actor, critics = self.init_networks(key, hparams)
         return TD3State(
             actor=actor,
             critics=critics,
@@ -190,7 +185,8 @@ class TD3(ActorCritic):
         )
 
     def update_critics(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        hp, q_values = state.hparams, jax.vmap(self.q_value, (0, None, None))
+        hp = state.hparams
+        q_values = jax.vmap(self.q_value, (0, None, None))
 
         def sum_of_losses(critics: PyTree, batch: Transition, noise: LearningNoise) -> Array:
             next_action = self.smoothed_target_action(state, batch.next_obs, noise)
@@ -205,7 +201,8 @@ class TD3(ActorCritic):
         return state.replace(critics=critics, critic_opt_state=opt_state)
 
     def update_actor(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
-        hp, critic = state.hparams, jax.tree.map(lambda x: x[0], state.critics)
+        hp = state.hparams
+        critic = jax.tree.map(lambda x: x[0], state.critics)
 
         def sum_of_losses(actor: PyTree, batch: Transition, noise: LearningNoise) -> Array:
             action = self.action(self.outputs(actor, batch.obs), noise.policy, state)
@@ -235,7 +232,8 @@ class TD3(ActorCritic):
 
         Source: Fujimoto et al. (2018), eq. 14.
         """
-        hp, clip = state.hparams, state.hparams.target_noise_clip
+        hp = state.hparams
+        clip = hp.target_noise_clip
         smoothing = jnp.clip(hp.target_noise_std * noise.smoothing, -clip, clip)
         action = self.action(self.outputs(state.target_actor, obs), noise.target_policy, state)
         return self.restrict(action + self.max_action * smoothing)
