@@ -123,7 +123,8 @@ class DDQN(OffPolicy):
     config: DDQNConfig
 
     def __init__(self, config: DDQNConfig, obs_dim: int, num_actions: int):
-        self.config, self.obs_dim = config, obs_dim
+        self.config = config
+        self.obs_dim = obs_dim
         self.network = config.network(num_actions)
 
     def init(self, key: Array, hparams: Hparams) -> DDQNState:
@@ -160,14 +161,15 @@ class DDQN(OffPolicy):
 
         Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
         """
-        hp, config, q_values = state.hparams, self.config, self.q_values
+        hp = state.hparams
 
         def sum_of_losses(params: PyTree, batch: Transition) -> Array:
-            target_next_q = q_values(state.target_params, batch.next_obs)  # [actions, batch]
-            next_q = q_values(params, batch.next_obs) if config.double else target_next_q
+            # [actions, batch]
+            target_next_q = self.q_values(state.target_params, batch.next_obs)
+            next_q = self.q_values(params, batch.next_obs) if self.config.double else target_next_q
             discount = hp.discount * batch.discount
             targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
-            predicted = select_action(q_values(params, batch.obs), batch.action)
+            predicted = select_action(self.q_values(params, batch.obs), batch.action)
             return jnp.sum(batch.weight * (predicted - jax.lax.stop_gradient(targets)) ** 2)
 
         params, opt_state = adam_step(sum_of_losses, state.params, state.opt_state, (batch,), hp)

@@ -187,12 +187,14 @@ class ICM(nn.Module):
         )
 
 
+@dataclass(frozen=True, eq=False)
 class Curious:
     """The pure functions of a curious agent."""
 
-    def __init__(self, agent: Agent, model: ICM, obs_dim: int, is_discrete: bool):
-        self.agent, self.model = agent, model
-        self.obs_dim, self.is_discrete = obs_dim, is_discrete
+    agent: Agent
+    model: ICM
+    obs_dim: int
+    is_discrete: bool
 
     def init(self, key: Array, hparams: Hparams) -> CuriousState:
         key_agent, key_icm = jax.random.split(key)

@@ -163,6 +163,7 @@ class Batch(NamedTuple):
     returns: PerStep
 
 
+@dataclass(eq=False)
 class PPO(Algorithm):
     """The agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
@@ -186,38 +187,34 @@ class PPO(Algorithm):
     """
 
     config: PPOConfig
+    obs_dim: int
+    action_dim: int
+    length: int
+    max_action: float | None = None
 
-    def __init__(
-        self,
-        config: PPOConfig,
-        obs_dim: int,
-        action_dim: int,
-        length: int,
-        max_action: float | None = None,
-    ):
-        number, most = config.num_minibatches, max(1, length // 2)
-        must = f"must be at most half of the rollout's {length} steps"
+    def __post_init__(self) -> None:
+        config = self.config
+        number = config.num_minibatches
+        most = max(1, self.length // 2)
+        must = f"must be at most half of the rollout's {self.length} steps"
         require(number <= most, "agent.num_minibatches", must, got=number, use=most)
-        self.config, self.obs_dim, self.length = config, obs_dim, length
-        self.max_action, self.std_dim = max_action, 0 if max_action is None else action_dim
-        size = {"hidden_size": config.hidden_size, "num_layers": config.num_layers}
-        how = {"activation": config.activation, "learn_prelu_slope": True}
-        self.actor, self.critic = (MLP(n, **size, **how) for n in (action_dim, 1))
+        hidden = (config.hidden_size, config.num_layers, config.activation)
+        self.actor = MLP(self.action_dim, *hidden, learn_prelu_slope=True)
+        self.critic = MLP(1, *hidden, learn_prelu_slope=True)
+        self.std_dim = 0 if self.max_action is None else self.action_dim
         self.optimizer = config.optimizer()
 
     def buffer(self) -> BufferMaker:
         return rollout_buffer(self.length)
 
-    def init_params(self, key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
+    def init(self, key: Array, hparams: Hparams) -> PPOState:
         key_actor, key_critic = jax.random.split(key)
-        return {
-            "actor": init_narrowed(self.actor, key_actor, self.obs_dim, hidden_size),
-            "critic": init_narrowed(self.critic, key_critic, self.obs_dim, hidden_size),
+        size = hparams.hidden_size
+        params = {
+            "actor": init_narrowed(self.actor, key_actor, self.obs_dim, size),
+            "critic": init_narrowed(self.critic, key_critic, self.obs_dim, size),
             "std": jnp.full(self.std_dim, self.config.init_action_std, jnp.float32),
         }
-
-    def init(self, key: Array, hparams: Hparams) -> PPOState:
-        params = self.init_params(key, hparams.hidden_size)
         return PPOState(
             params=params,
             opt_state=self.optimizer.init(params),
@@ -248,7 +245,8 @@ class PPO(Algorithm):
         It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
         steps. If this number does not divide the rollout, each pass leaves some steps out.
         """
-        config, hp = self.config, state.hparams
+        config = self.config
+        hp = state.hparams
         steps = batch.transitions(self.obs_dim, is_discrete=self.std_dim == 0)
         rollout, return_moments = self.prepared(state, steps, batch.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, rollout.returns.size)
@@ -291,19 +289,21 @@ class PPO(Algorithm):
 
         Source: Schulman et al. (2016), eq. 11 to 16.
         """
-        hp, params, moments = state.hparams, state.params, state.return_moments
-        old_log_prob, _, value = self.evaluate_actions(params, steps.obs, steps.action)
+        hp = state.hparams
+        moments = state.return_moments
+        old_log_prob, _, value = self.evaluate_actions(state.params, steps.obs, steps.action)
         if self.config.advantages == "monte_carlo":
             decay = jnp.broadcast_to(hp.discount, ended.shape)
             returns = normalized(discounted_sums(steps.reward, decay, ended))
             return Batch(steps.obs, steps.action, old_log_prob, None, returns), moments
-        decay, reward = hp.discount * steps.discount, steps.reward
+        decay = hp.discount * steps.discount
+        reward = steps.reward
         if self.config.normalize_rewards:
             returns = discounted_sums(reward, decay, ended)
             squares = jnp.sum((returns - returns.mean()) ** 2)
             moments = merged_moments(moments, (jnp.float32(returns.size), returns.mean(), squares))
             reward = reward * (1 / std_of(moments))
-        delta = reward + decay * self.value(params, steps.next_obs) - value
+        delta = reward + decay * self.value(state.params, steps.next_obs) - value
         advantage = discounted_sums(delta, hp.gae_lambda * decay, ended)
         return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), moments
 

@@ -98,7 +98,8 @@ class Tabular(Algorithm):
     config: QLearningConfig
 
     def __init__(self, config: QLearningConfig, num_states: int, num_actions: int):
-        self.config, self.shape = config, (num_states, num_actions)
+        self.config = config
+        self.shape = (num_states, num_actions)
 
     def buffer(self) -> BufferMaker:
         return no_buffer()
@@ -123,10 +124,10 @@ class Tabular(Algorithm):
         return epsilon_greedy(key, q_row, state.epsilon)
 
     def update(self, key: Array, state: TabularState, batch: Transition) -> TabularState:
-        hp, step = state.hparams, batch
-        value = self.config.next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
-        target = step.reward + hp.discount * step.discount * value
-        is_visited = mask_of(step.obs, step.action, self.shape)
+        hp = state.hparams
+        value = self.config.next_value(key, row_of(state.q_values, batch.next_obs), state.epsilon)
+        target = batch.reward + hp.discount * batch.discount * value
+        is_visited = mask_of(batch.obs, batch.action, self.shape)
         moved = state.q_values + hp.learning_rate * (target - state.q_values)
         return state.replace(q_values=jnp.where(is_visited, moved, state.q_values))
 
