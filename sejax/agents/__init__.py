@@ -67,7 +67,8 @@ def make_agent(
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
     is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
-    return (_make_once if is_key else _make_agent)(config, exploration, task, varied)
+    make = _make_once if is_key else _make_agent
+    return make(config, exploration, task, varied)
 
 
 def _make_agent(

@@ -67,8 +67,10 @@ def require_agent(agent: "Agent", observation: Space, action: Space) -> None:
     """
     fix = "Set agent=sejax.make_agent(config, task) with this task."
     require_part("agent", Agent, agent, fix)
-    got, sizes = agent.spec.sizes, sizes_of(observation, action)
-    require(got in (None, sizes), "agent", f"must be made for {sizes}", got=got, fix=fix)
+    task_sizes = sizes_of(observation, action)
+    sizes = agent.spec.sizes
+    is_fit = sizes is None or sizes == task_sizes
+    require(is_fit, "agent", f"must be made for {task_sizes}", got=sizes, fix=fix)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +144,8 @@ class Agent:
         if self.varied is None:
             run_self = make_run(self)
             return lambda key, *args: run_self(key, *args, self.hparams)
-        draw, runs = self.varied.draw, [make_run(agent) for agent in self.varied.agents]
+        draw = self.varied.draw
+        runs = [make_run(agent) for agent in self.varied.agents]
 
         def run(key: Array, *args: PyTree) -> T:
             variant, hparams, _ = draw(drawing_key(key))

@@ -34,23 +34,13 @@ from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
 from sejax.ops.optimizers import clip_by_global_norm, scale_by_adam
 from sejax.ops.scores import Moments, merged_moments
-from sejax.options import (
-    LARGEST,
-    Activation,
-    Count,
-    Depth,
-    Fraction,
-    NonNegative,
-    Positive,
-    option,
-    require,
-)
+from sejax.options import Activation, Count, Depth, Fraction, NonNegative, Positive, option, require
 
 PerStep = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
 Moved = tuple[PyTree, optax.OptState]  # parameters, and the optimizer's state
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
-_MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
+_MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite however far the policy has moved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +111,10 @@ class PPOConfig(AgentOptions):
 
     def spec(self) -> AgentSpec:
         # It learns from the start; `warmup_episodes` only holds back the stop rule.
-        minibatch = (self.rollout_steps or LARGEST) // self.num_minibatches
-        is_small = self.hidden_size * minibatch <= cpu.SMALL_PRODUCT
+        # A rollout of `update_episodes` counts as long.
+        is_small = self.rollout_steps is not None and (
+            self.hidden_size * (self.rollout_steps // self.num_minibatches) <= cpu.SMALL_PRODUCT
+        )
         return dataclasses.replace(
             super().spec(),
             learns_from=0,
@@ -323,7 +315,8 @@ class PPO(Algorithm):
             advantage = jax.lax.stop_gradient(batch.returns - value)
         else:
             advantage = normalized(batch.advantage)
-        ratio = bounded_exp(log_prob - batch.old_log_prob)
+        log_ratio = jnp.clip(log_prob - batch.old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
+        ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, 1 - hp.clip_ratio, 1 + hp.clip_ratio)
         surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
         value_error = jnp.mean((value - batch.returns) ** 2)
@@ -414,8 +407,3 @@ def normalized(x: PerStep) -> PerStep:
     """`x` less its mean, divided by its unbiased std plus 1e-5."""
     std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
     return (x - jnp.mean(x)) * (1 / (std + 1e-5))
-
-
-def bounded_exp(log_ratio: PerStep) -> PerStep:
-    """Exponential of a log ratio. It is finite however far the policy has moved."""
-    return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))

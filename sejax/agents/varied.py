@@ -47,14 +47,15 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
 
     Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
-    cls, hints = type(config), get_type_hints(type(config))
-    names = [field.name for field in dataclasses.fields(config)]
-    how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
+    cls = type(config)
+    hints = get_type_hints(cls)
+    marks_of = {field.name: marks(cls, field.name) for field in dataclasses.fields(config)}
+    how = {name: mark["varied"] for name, mark in marks_of.items() if mark.get("varied")}
     is_whole = bool(how) and ("num_layers" in how) == ("hidden_size" in how)
     must = f"must be default, as {cls.__name__} varies nothing or half a network"
     require(is_whole, "agent_hparams", must, got="varied", use="default")
     # Traced options first: the order decides which key draws which option.
-    ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])
+    ordered = sorted(how, key=lambda name: not marks_of[name]["traced"])
     return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
 
 

@@ -59,10 +59,12 @@ class EvosaxConfig(StrategyOptions):
         require_known("es.name", self.name, ALGORITHMS)
         size = self.population_size
         require(size % 2 == 0, "es.population_size", "must be even", got=size, use=size + 1)
-        for name, algorithms in (("noise_std_decay", "open_es"), ("step_size", "open_es pgpe")):
-            value, is_used = getattr(self, name), self.name in algorithms.split()
+        users = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
+        for name, algorithms in users.items():
+            value = getattr(self, name)
+            is_fit = self.name in algorithms or value == getattr(type(self), name)
             message = f"must be left out with es={self.name}, which has none; got {value}."
-            require(is_used or value == getattr(type(self), name), f"es.{name}", message)
+            require(is_fit, f"es.{name}", message)
 
     def make(self, num_dims: int) -> Strategy:
         """The algorithm over vectors of `num_dims` numbers."""
@@ -75,8 +77,8 @@ class EvosaxConfig(StrategyOptions):
             options["optimizer"] = adam if optimizer == "adam" else optax.sgd(1.0)
         if self.name == "open_es":
             # evosax computes the next generation's std from the number of the current generation.
-            std, decay = self.noise_std, self.noise_std_decay
-            schedule = optax.exponential_decay(std * decay, 1, decay)
+            decay = self.noise_std_decay
+            schedule = optax.exponential_decay(self.noise_std * decay, 1, decay)
             # It divides by the std, which after many generations would be 0 in 32 bits.
             options["std_schedule"] = lambda number: jnp.maximum(schedule(number), LEAST)
         algorithm = distribution_based_algorithms[cls](
@@ -100,9 +102,7 @@ class EvosaxConfig(StrategyOptions):
 
 
 def from_evosax(
-    algorithm: "DistributionBasedAlgorithm",
-    params: "Params | None" = None,
-    **fields: Any,
+    algorithm: "DistributionBasedAlgorithm", params: "Params | None" = None, **fields: Any
 ) -> Strategy:
     """A strategy from an algorithm of evosax. The algorithm's mean is the incumbent.
 
@@ -129,10 +129,10 @@ def from_evosax(
         # An infinity would poison algorithms that standardise. So a score that is not finite
         # becomes worse than the worst.
         fitness = -jnp.where(jnp.isfinite(scores), scores, below_all(scores))
-        told = algorithm.tell(key, population, fitness, state, params)[0]
+        updated = algorithm.tell(key, population, fitness, state, params)[0]
         # Some algorithms move, or shrink their std, where no candidate is better than another.
-        is_told = fitness.max() > fitness.min()
-        return jax.tree.map(lambda new, old: jnp.where(is_told, new, old), told, state)
+        is_informative = fitness.max() > fitness.min()
+        return jax.tree.map(lambda new, old: jnp.where(is_informative, new, old), updated, state)
 
     return Strategy(
         init=lambda key, mean: algorithm.init(key, mean, params),

@@ -3,7 +3,6 @@
 Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/reference.md` 2.
 """
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -103,8 +102,7 @@ class NESConfig(StrategyOptions):
             if self.update_rule == "paper":
                 # After many generations a decaying std is 0 in 32 bits.
                 step = step / (num_noises * jnp.maximum(state.noise_std, LEAST))
-            return dataclasses.replace(
-                state,
+            return state.replace(
                 mean=(1 - self.weight_decay) * state.mean + step,
                 noise_std=state.noise_std * self.noise_std_decay,
                 step_size=state.step_size * self.step_size_decay,
@@ -122,8 +120,9 @@ class NESConfig(StrategyOptions):
         )
 
 
-@struct.dataclass
-class NESState:
+class NESState(struct.PyTreeNode):
+    """The search distribution of a generation, and the size of its step."""
+
     mean: Float[Array, " dims"]  # psi
     noise_std: Array  # sigma
     step_size: Array  # alpha
