@@ -35,8 +35,7 @@ from sejax.scoring import GenerationInfo, Scoring
 from sejax.training import TrainingConfig
 
 
-@struct.dataclass
-class LearnState:
+class LearnState(struct.PyTreeNode):
     """What the next generation needs, and the best proxy so far."""
 
     key: Array
@@ -52,8 +51,7 @@ class LearnState:
     solved: Array  # with stop_when_solved: the run is over; later generations cost nothing
 
 
-@struct.dataclass
-class LearnResult:
+class LearnResult(struct.PyTreeNode):
     """Result of a whole run."""
 
     weights: PyTree  # of the best proxy, in the form of its `init_weights`
@@ -77,8 +75,9 @@ class Bilevel:
     @property
     def solved_score(self) -> float | None:
         """Incumbent mean at which the task counts as solved; None if scores cannot tell."""
-        task, objective = self.proxy.task, self.scoring.objective
-        return task.solved_reward if objective.scores_are_returns and task.is_solvable else None
+        task = self.proxy.task
+        can_tell = self.scoring.objective.scores_are_returns and task.is_solvable
+        return task.solved_reward if can_tell else None
 
     def ends_run(self, score: Array) -> Array | bool:
         """Whether this incumbent mean ends the run."""
@@ -147,8 +146,7 @@ class Bilevel:
         score = or_minus_inf(scores.incumbent_mean)
         agent_means = or_minus_inf(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
-        after = dataclasses.replace(
-            state,
+        after = state.replace(
             es_state=es_state,
             generation=state.generation + 1,
             incumbent=candidates.incumbent,

@@ -57,8 +57,7 @@ class Tests(NamedTuple):
     scored: Float[Array, " episode"]
 
 
-@struct.dataclass
-class _Episode:
+class _Episode(struct.PyTreeNode):
     """Carry of an episode."""
 
     active: Array
@@ -162,7 +161,7 @@ def make_recorder(
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
             after, steps = decide(key_steps, agent_state, state, task.params)
-            return dataclasses.replace(after, active=state.active & after.active), steps
+            return after.replace(active=state.active & after.active), steps
 
         start = begin(key_reset, True, task.params)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
@@ -244,8 +243,10 @@ def make_evaluator(
     require_agent(agent, task.observation, task.action)
     require_part("training", TrainingConfig, training)
     # An agent may never end a test. A training of less than 1,000 steps is a trial.
-    most, got = 1000 * max(training.max_steps or LARGEST, 1000), task.max_steps
-    require(got <= most, "env.max_steps", f"must be at most {most:,}", got=f"{got:,}", use=1000)
+    steps = task.max_steps
+    most = 1000 * max(training.max_steps or LARGEST, 1000)
+    must = f"must be at most {most:,}"
+    require(steps <= most, "env.max_steps", must, got=f"{steps:,}", use=1000)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)

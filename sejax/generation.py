@@ -91,8 +91,7 @@ class Layout:
         return jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
 
 
-@struct.dataclass
-class Candidates:
+class Candidates(struct.PyTreeNode):
     """What a generation evaluates, and what `Strategy.tell` needs beside the scores."""
 
     population: Float[Array, "pop dims"]
@@ -104,8 +103,7 @@ class Candidates:
     es_state: StrategyState  # after `Strategy.ask`
 
 
-@struct.dataclass
-class Trainings:
+class Trainings(struct.PyTreeNode):
     """The trainings of one agent in a generation, leaves `[training, ...]`."""
 
     key: Array
@@ -158,8 +156,9 @@ class GenerationEvaluator:
         training = tested_throughout(training) if objective.needs_tests else training
 
         def evaluator_of(agent: Agent) -> Callable[[Trainings], Outcome]:
-            task, test_env = proxy.task, objective.test_env
-            evaluate = make_evaluator(agent, proxy, task, training, test_env, in_batches=False)
+            evaluate = make_evaluator(
+                agent, proxy, proxy.task, training, objective.test_env, in_batches=False
+            )
 
             def evaluate_one(one: Trainings) -> Outcome:
                 params = proxy.params(unravel(one.weights))

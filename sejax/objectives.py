@@ -20,8 +20,7 @@ from sejax.envs.wrappers import PartlyScored, PartParams
 from sejax.options import MOST, Count, NonNegative, Options, require
 
 
-@struct.dataclass
-class Outcome:
+class Outcome(struct.PyTreeNode):
     """The result of one agent. Leaves are `[]`, returns `[episode]`; `[agent, ...]` for many.
 
     Attributes:
@@ -101,7 +100,8 @@ def _checked(scores: Array, nonfinite: Bool[Array, "*agent"]) -> Float[Array, "*
     Raises:
       ConfigError: unless there is a score for each agent.
     """
-    scores, shape = jnp.asarray(scores), nonfinite.shape
+    scores = jnp.asarray(scores)
+    shape = nonfinite.shape
     require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
     return jnp.where(nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 

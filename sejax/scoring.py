@@ -18,8 +18,7 @@ from sejax.objectives import Objective, Outcome
 from sejax.ops.scores import finite_mean
 
 
-@struct.dataclass
-class Scores:
+class Scores(struct.PyTreeNode):
     """Scores of a generation.
 
     Attributes:
@@ -37,8 +36,7 @@ class Scores:
     diverged: Bool[Array, " training"]
 
 
-@struct.dataclass
-class AgentInfo:
+class AgentInfo(struct.PyTreeNode):
     """Statistics for each agent of a mixture, `[agent]`."""
 
     incumbent_mean: Array
@@ -47,8 +45,7 @@ class AgentInfo:
     num_nonfinite: Array
 
 
-@struct.dataclass
-class GenerationInfo:
+class GenerationInfo(struct.PyTreeNode):
     """Statistics of a generation."""
 
     generation: Array
@@ -130,13 +127,18 @@ class Scoring:
     def _scores(self, of_trainings: Float[Array, " training"]) -> Scores:
         population, incumbent = jnp.split(of_trainings, [self.layout.num_evaluations])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
-        by_agent = zip(turns, self.layout.evaluations_of, strict=True)
-        pairs = [with_diverged_last(scores, population[numbers]) for scores, numbers in by_agent]
-        repaired, agent_means = map(jnp.stack, zip(*pairs, strict=True))
+        repaired = []
+        means = []
+        for scores, numbers in zip(turns, self.layout.evaluations_of, strict=True):
+            repaired_scores, mean = with_diverged_last(scores, population[numbers])
+            repaired.append(repaired_scores)
+            means.append(mean)
+        incumbent = jnp.stack(repaired)  # [agent, turn]
+        agent_means = jnp.stack(means)
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
-            incumbent=repaired.T.ravel(),
+            incumbent=incumbent.T.ravel(),
             agent_means=agent_means,
             incumbent_mean=aggregate(agent_means),
             diverged=jnp.isnan(of_trainings),
@@ -159,6 +161,7 @@ def with_diverged_last(
     generation: a mean without them would rank an incumbent by its other agents alone. If all
     diverged, the mean is nan.
     """
-    lowest, diverged = jnp.nanmin(jnp.concatenate([population, scores])), jnp.isnan(scores)
+    lowest = jnp.nanmin(jnp.concatenate([population, scores]))
+    diverged = jnp.isnan(scores)
     repaired = jnp.where(diverged & ~diverged.all(), lowest, scores)
     return repaired, finite_mean(repaired)

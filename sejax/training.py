@@ -4,7 +4,6 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 `docs/reference.md` 3.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -93,16 +92,15 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
     Raises:
       ConfigError: if even the longest episodes are too few.
     """
-    if not training.is_fixed_length:
+    if training.max_steps is None or not training.is_fixed_length:
         return
-    assert training.max_steps is not None
-    least, got = -(-training.max_steps // max_episode_steps), training.max_episodes
+    episodes = training.max_episodes
+    least = math.ceil(training.max_steps / max_episode_steps)
     must = f"must suffice for {name}.max_steps={training.max_steps}"
-    require(got >= least, f"{name}.max_episodes", must, got=got, use=least)
+    require(episodes >= least, f"{name}.max_episodes", must, got=episodes, use=least)
 
 
-@struct.dataclass
-class TrainResult:
+class TrainResult(struct.PyTreeNode):
     """The result of one training.
 
     Attributes:
@@ -143,8 +141,7 @@ class _StepKeys(NamedTuple):
     test: Array
 
 
-@struct.dataclass
-class _LoopState:
+class _LoopState(struct.PyTreeNode):
     """Carry of the step loop. Buffers and a row for each episode are carried beside it."""
 
     active: Array
@@ -244,8 +241,10 @@ def num_parallel_on_cpu(
     Other agents train one by one if each may stop at its own time.
     """
     width = agent.spec.cpu_num_parallel
-    if width is None or not training.is_fixed_length:
-        return None if width is None else 1
+    if width is None:
+        return None
+    if not training.is_fixed_length:
+        return 1
     return min(width, cpu.width_of(num_agents))
 
 
@@ -295,9 +294,9 @@ class _Loop:
         curve = {"returns": no_returns, "episode_ends": jnp.zeros(max_episodes, jnp.int32)}
         if self.test_fn is not None:
             curve["test_returns"] = no_returns
-        body, per_check = partial(self.step, buffer), STEPS_PER_CHECK
-        if buffer.learns_every > 1:
-            body, per_check = partial(self.rollout, buffer), 1
+        learns_each_step = buffer.learns_every == 1
+        body = partial(self.step if learns_each_step else self.rollout, buffer)
+        per_check = STEPS_PER_CHECK if learns_each_step else 1
         (stored, curve), state = while_any_active(
             body, (buffer.init(), curve), state, (key_steps, env_params), per_check
         )
@@ -355,12 +354,13 @@ class _Loop:
 
         first_step = state.step
         large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
-        (stored, _), (key, _) = large, consts
+        stored, _ = large
+        key, _ = consts
         is_full = state.step == first_step + buffer.learns_every
         # Keys of the last step, which did not learn.
         keys = _StepKeys(*step_keys(key, state.step - 1, 6))
         agent_state = self.learn(buffer, stored, None, state.step, keys, state, is_full)
-        return large, dataclasses.replace(state, agent_state=agent_state)
+        return large, state.replace(agent_state=agent_state)
 
     def learn(
         self,
@@ -392,7 +392,8 @@ class _Loop:
         learns: bool = True,
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
-        (stored, curve), (key, env_params) = large, consts
+        stored, curve = large
+        key, env_params = consts
         keys = _StepKeys(*step_keys(key, state.step, 6))
         action = self.agent.act(keys.act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
@@ -415,8 +416,7 @@ class _Loop:
         # The episode's row of the curve; one that is out of range is dropped.
         row = jnp.where(finished, state.episode, self.training.max_episodes)
         entries = {"returns": state.episode_return + reward, "episode_ends": train_steps}
-        state = dataclasses.replace(
-            state,
+        state = state.replace(
             step=state.step + 1,
             train_steps=train_steps,
             episode_return=entries["returns"],
@@ -444,16 +444,13 @@ class _Loop:
         judged = state.episode_return
         if self.test_fn is not None:
             tested, num_steps = self.test_fn(keys.test, state.agent_state, finished)
-            state = dataclasses.replace(
-                state, tested=tested, test_steps=state.test_steps + num_steps
-            )
+            state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])
         stop = self.stops(state, recent)
         obs, env_state = self.env.reset_env(keys.reset, env_params)
         num_episodes = state.episode + 1
-        return dataclasses.replace(
-            state,
+        return state.replace(
             active=state.active & ~stop,
             episode=num_episodes,
             episode_return=jnp.float32(0),
@@ -465,7 +462,8 @@ class _Loop:
 
     def stops(self, state: _LoopState, recent: Array) -> Array:
         """Whether training ends with the episode that has just ended."""
-        training, first = self.training, self.agent.spec.warmup_episodes
+        training = self.training
+        first = self.agent.spec.warmup_episodes
         num_episodes = state.episode + 1
         stop = (num_episodes >= training.max_episodes) | state.nonfinite
         may_stop = (state.episode >= first) & (state.train_steps >= training.min_steps)
