@@ -247,12 +247,13 @@ def make_bilevel(
     strategy = make("es", es, mean.size)
     _require_population(strategy, mean)
     layout = Layout(strategy=strategy, mixture=Mixture.of(agent))
-    where = {"devices": devices, "num_parallel": num_parallel}
     bilevel = Bilevel(
         proxy=proxy,
         layout=layout,
         scoring=Scoring(objective=objective, layout=layout),
-        evaluate=GenerationEvaluator(proxy, unravel, training, objective, layout, **where),
+        evaluate=GenerationEvaluator(
+            proxy, unravel, training, objective, layout, devices=devices, num_parallel=num_parallel
+        ),
         unravel=unravel,
         stop_when_solved=stop_when_solved,
     )
@@ -263,9 +264,13 @@ def make_bilevel(
 
 def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None:
     """Checks that a strategy, which may be the user's own, asks for the population that it says."""
-    asked = jax.eval_shape(lambda x: strategy.ask(x, strategy.init(x, mean))[0], jax.random.key(0))
-    shape = (strategy.num_candidates, mean.size)
-    require(asked.shape == shape, "es", f"must ask for candidates {shape}", got=asked.shape)
+
+    def population(key: Array) -> Array:
+        return strategy.ask(key, strategy.init(key, mean))[0]
+
+    shape = jax.eval_shape(population, jax.random.key(0)).shape
+    expected = (strategy.num_candidates, mean.size)
+    require(shape == expected, "es", f"must ask for candidates {expected}", got=shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
     require(least > 0, "es", "must evaluate each candidate and the incumbent", got=least)
     is_paired = not strategy.antithetic or shape[0] % 2 == 0

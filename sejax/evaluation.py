@@ -79,8 +79,14 @@ def _greedy(
 
     def begin(key: Array, active: Array | bool, params: PyTree) -> _Episode:
         obs, env_state = env.reset_env(key, params)
-        zero = jnp.float32(0)
-        return _Episode(jnp.asarray(active), jnp.int32(0), zero, zero, obs, env_state)
+        return _Episode(
+            active=jnp.asarray(active),
+            num_steps=jnp.int32(0),
+            total=jnp.float32(0),
+            scored=jnp.float32(0),
+            obs=obs,
+            env_state=env_state,
+        )
 
     def step(
         key: Array, agent_state: AgentState, before: _Episode, params: PyTree
@@ -245,8 +251,8 @@ def make_evaluator(
     # An agent may never end a test. A training of less than 1,000 steps is a trial.
     steps = task.max_steps
     most = 1000 * max(training.max_steps or LARGEST, 1000)
-    must = f"must be at most {most:,}"
-    require(steps <= most, "env.max_steps", must, got=f"{steps:,}", use=1000)
+    rule = f"must be at most {most:,}"
+    require(steps <= most, "env.max_steps", rule, got=f"{steps:,}", use=1000)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)
@@ -376,7 +382,9 @@ def _evaluation_program(
     def program(keys: Array, env_params: PyTree) -> PyTree:
         width = num_parallel_on_cpu(agent, training, keys.shape[0])
         train = functools.partial(evaluate, env_params=env_params)
-        counts = {"num_devices": devices, "num_parallel": num_parallel}
-        return spread_over_devices(train, cpu_num_parallel=width, **counts)(keys)
+        spread = spread_over_devices(
+            train, num_devices=devices, num_parallel=num_parallel, cpu_num_parallel=width
+        )
+        return spread(keys)
 
     return jax.jit(program, compiler_options=compiler_options())

@@ -83,15 +83,12 @@ class Scoring:
         Args:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
+        layout = self.layout
         scores = self._scores(self.objective(outcome))
-        # nan if the agent of one evaluation diverged
-        aggregate = jnp.mean if self.layout.strategy.eval_aggregate == "mean" else jnp.min
-        population = aggregate(
-            scores.population.reshape(-1, self.layout.strategy.num_evals), axis=1
-        )
-        return self.layout.mixture.comparable(
-            population, self.layout.candidates_of, scores.agent_means
-        )
+        aggregate = jnp.mean if layout.strategy.eval_aggregate == "mean" else jnp.min
+        by_candidate = scores.population.reshape(-1, layout.strategy.num_evals)
+        population = aggregate(by_candidate, axis=1)  # nan if the agent of one evaluation diverged
+        return layout.mixture.comparable(population, layout.candidates_of, scores.agent_means)
 
     def reported(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""

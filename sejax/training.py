@@ -96,8 +96,8 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         return
     episodes = training.max_episodes
     least = math.ceil(training.max_steps / max_episode_steps)
-    must = f"must suffice for {name}.max_steps={training.max_steps}"
-    require(episodes >= least, f"{name}.max_episodes", must, got=episodes, use=least)
+    rule = f"must suffice for {name}.max_steps={training.max_steps}"
+    require(episodes >= least, f"{name}.max_episodes", rule, got=episodes, use=least)
 
 
 class TrainResult(struct.PyTreeNode):
@@ -304,7 +304,9 @@ class _Loop:
             agent_state=state.agent_state,
             train_steps=state.train_steps,
             episodes=state.episode,
-            **{"test_returns": None} | curve,
+            returns=curve["returns"],
+            test_returns=curve.get("test_returns"),
+            episode_ends=curve["episode_ends"],
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             test_steps=state.test_steps,
             stored=stored if self.keeps_stored else None,
@@ -404,7 +406,8 @@ class _Loop:
         ended = terminated | truncated | nonfinite
         # What a target bootstraps with, before gamma.
         discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
-        discount = jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+        if self.limit_is_terminal:
+            discount = jnp.where(truncated, 0.0, discount)
         transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # not in a training that is over

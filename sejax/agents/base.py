@@ -67,10 +67,9 @@ def require_agent(agent: "Agent", observation: Space, action: Space) -> None:
     """
     fix = "Set agent=sejax.make_agent(config, task) with this task."
     require_part("agent", Agent, agent, fix)
-    task_sizes = sizes_of(observation, action)
     sizes = agent.spec.sizes
-    is_fit = sizes is None or sizes == task_sizes
-    require(is_fit, "agent", f"must be made for {task_sizes}", got=sizes, fix=fix)
+    in_task = sizes_of(observation, action)
+    require(sizes in (None, in_task), "agent", f"must be made for {in_task}", got=sizes, fix=fix)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -141,11 +141,9 @@ class DDQN(OffPolicy):
 
     def begin_episode(self, state: DDQNState, episode: Array) -> DDQNState:
         """Sets the share of random actions in the episode, unless it falls with steps."""
-        hp = state.hparams
-        if hp.exploration_steps is not None:
+        if state.hparams.exploration_steps is not None:
             return state
-        epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
-        return state.replace(epsilon=epsilon)
+        return state.replace(epsilon=decayed_epsilon(state.hparams, episode))
 
     def q_values(self, params: PyTree, obs: Array) -> Float[Array, "actions *batch"]:
         return cast(Array, self.network.apply(params, obs))

@@ -114,8 +114,8 @@ class Mixture:
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
         # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
-        must = f"must be larger: {num_candidates} candidates do not suffice for the agents' shares"
-        require(are_enough, "es.population_size", must, use=size)
+        rule = f"must be larger: {num_candidates} candidates do not suffice for the agents' shares"
+        require(are_enough, "es.population_size", rule, use=size)
         mirrored = (0, num_dealt) if antithetic else (0,)
         return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
 

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sejax.agents.base import Hparams
+
 
 def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
     """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
@@ -11,17 +13,17 @@ def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Flo
     return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)
 
 
-def decayed_epsilon(
-    init: Array | float, minimum: Array | float, decay: Array | float, episode: Array
-) -> Array:
+def decayed_epsilon(hparams: Hparams, episode: Array) -> Array:
     """Share of random actions in an episode, counted from 0, `[]` float32.
 
-    It is `init` in episode 0, even where that is less than `minimum`, and
-    `max(init * decay**episode, minimum)` afterwards.
+    It is `epsilon_init` in episode 0, even where that is less than `epsilon_min`, and
+    `max(epsilon_init * epsilon_decay**episode, epsilon_min)` afterwards.
 
     Source: `docs/reference.md` 3.4.
     """
-    return jnp.where(episode == 0, init, jnp.maximum(init * decay**episode, minimum))
+    is_first = episode == 0
+    decayed = hparams.epsilon_init * hparams.epsilon_decay**episode
+    return jnp.where(is_first, hparams.epsilon_init, jnp.maximum(decayed, hparams.epsilon_min))
 
 
 def epsilon_greedy(

@@ -113,9 +113,7 @@ class Tabular(Algorithm):
         )
 
     def begin_episode(self, state: TabularState, episode: Array) -> TabularState:
-        hp = state.hparams
-        epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
-        return state.replace(epsilon=epsilon)
+        return state.replace(epsilon=decayed_epsilon(state.hparams, episode))
 
     def act(self, key: Array, state: TabularState, obs: Int[Array, ""], explore: bool) -> Array:
         q_row = row_of(state.q_values, obs)

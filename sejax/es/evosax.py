@@ -59,8 +59,8 @@ class EvosaxConfig(StrategyOptions):
         require_known("es.name", self.name, ALGORITHMS)
         size = self.population_size
         require(size % 2 == 0, "es.population_size", "must be even", got=size, use=size + 1)
-        users = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
-        for name, algorithms in users.items():
+        algorithms_with = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
+        for name, algorithms in algorithms_with.items():
             value = getattr(self, name)
             is_fit = self.name in algorithms or value == getattr(type(self), name)
             message = f"must be left out with es={self.name}, which has none; got {value}."

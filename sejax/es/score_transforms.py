@@ -119,9 +119,9 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
             message = f"must take scores in jax; {choice} raised {told(error)}."
             raise ConfigError(FIELD, message) from error
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
-        must = f"must give {pop} finite weights for {pop} scores"
+        rule = f"must give {pop} finite weights for {pop} scores"
         fix = f"Mend {choice}, or set {FIELD}=rank."
-        require(is_fit, FIELD, must, got=weights.tolist(), fix=fix)
+        require(is_fit, FIELD, rule, got=weights.tolist(), fix=fix)
 
     def transform(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
         weights = jnp.asarray(function(or_lowest_finite(scores)), jnp.float32)
