@@ -148,7 +148,8 @@ def no_buffer() -> BufferMaker:
 
 def _dims(example: Transition) -> tuple[int, int | None]:
     """Length of an observation, and of an action unless it is an index."""
-    return example.obs.shape[0], example.action.shape[0] if example.action.ndim else None
+    action_dim = example.action.shape[0] if example.action.ndim else None
+    return example.obs.shape[0], action_dim
 
 
 # --- packed rows ---------------------------------------------------------------------------------
@@ -306,7 +307,7 @@ def sum_over_batch(fn: Callable[[PyTree], T], batch: PyTree, batch_size: Array |
         return fn(jax.tree.map(cut, batch))
 
     num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(block, num_blocks))
 
     def add(index: Array, total: T) -> T:
         return jax.tree.map(jnp.add, total, block(index))

@@ -17,7 +17,7 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -122,13 +122,6 @@ class PPOConfig(AgentOptions):
             cpu_num_parallel=cpu.SMALL_NUM_PARALLEL if is_small else 1,
         )
 
-    def optimizer(self) -> optax.GradientTransformation:
-        """Adam's direction; with `max_grad_norm` the gradient is clipped first."""
-        adam = scale_by_adam(self.adam_eps)
-        if self.max_grad_norm is None:
-            return adam
-        return optax.chain(clip_by_global_norm(self.max_grad_norm), adam)
-
 
 class PPOState(struct.PyTreeNode):
     """One agent. `params` are `{"actor", "critic", "std"}`."""
@@ -188,13 +181,15 @@ class PPO(Algorithm):
         config = self.config
         number = config.num_minibatches
         most = max(1, self.length // 2)
-        must = f"must be at most half of the rollout's {self.length} steps"
-        require(number <= most, "agent.num_minibatches", must, got=number, use=most)
+        rule = f"must be at most half of the rollout's {self.length} steps"
+        require(number <= most, "agent.num_minibatches", rule, got=number, use=most)
         hidden = (config.hidden_size, config.num_layers, config.activation)
         self.actor = MLP(self.action_dim, *hidden, learn_prelu_slope=True)
         self.critic = MLP(1, *hidden, learn_prelu_slope=True)
         self.std_dim = 0 if self.max_action is None else self.action_dim
-        self.optimizer = config.optimizer()
+        self.optimizer = scale_by_adam(config.adam_eps)
+        if config.max_grad_norm is not None:
+            self.optimizer = optax.chain(clip_by_global_norm(config.max_grad_norm), self.optimizer)
 
     def buffer(self) -> BufferMaker:
         return rollout_buffer(self.length)
@@ -215,19 +210,18 @@ class PPO(Algorithm):
         )
 
     def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
-        outputs: Any = self.actor.apply(state.params["actor"], obs)
+        outputs = cast(Array, self.actor.apply(state.params["actor"], obs))
         return self.sample(key, outputs, state.params["std"]) if explore else self.mode(outputs)
 
     def value(self, params: PyTree, obs: Array) -> PerStep:
         """The critic's values."""
-        outputs: Any = self.critic.apply(params["critic"], obs)
-        return outputs[0]
+        return cast(Array, self.critic.apply(params["critic"], obs))[0]
 
     def evaluate_actions(
         self, params: PyTree, obs: Array, action: Array
     ) -> tuple[PerStep, PerStep, PerStep]:
         """The actions' log probabilities, the entropies and the values."""
-        outputs: Any = self.actor.apply(params["actor"], obs)
+        outputs = cast(Array, self.actor.apply(params["actor"], obs))
         log_prob, entropy = self.probabilities(outputs, params["std"], action)
         return log_prob, entropy, self.value(params, obs)
 

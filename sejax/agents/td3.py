@@ -8,7 +8,7 @@ hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -224,8 +224,7 @@ class TD3(ActorCritic):
 
     def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
         """One critic's value of an action."""
-        values: Any = self.critic.apply(critic, jnp.concatenate([obs, action]))
-        return values[0]
+        return cast(Array, self.critic.apply(critic, jnp.concatenate([obs, action])))[0]
 
     def smoothed_target_action(self, state: TD3State, obs: Array, noise: LearningNoise) -> Array:
         r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, restricted.

@@ -50,29 +50,32 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
     cls = type(config)
     hints = get_type_hints(cls)
     marks_of = {field.name: marks(cls, field.name) for field in dataclasses.fields(config)}
-    how = {name: mark["varied"] for name, mark in marks_of.items() if mark.get("varied")}
-    is_whole = bool(how) and ("num_layers" in how) == ("hidden_size" in how)
-    must = f"must be default, as {cls.__name__} varies nothing or half a network"
-    require(is_whole, "agent_hparams", must, got="varied", use="default")
+    varied = {name: mark["varied"] for name, mark in marks_of.items() if mark.get("varied")}
+    is_whole = bool(varied) and ("num_layers" in varied) == ("hidden_size" in varied)
+    rule = f"must be default, as {cls.__name__} varies nothing or half a network"
+    require(is_whole, "agent_hparams", rule, got="varied", use="default")
     # Traced options first: the order decides which key draws which option.
-    ordered = sorted(how, key=lambda name: not marks_of[name]["traced"])
-    return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
+    names = sorted(varied, key=lambda name: not marks_of[name]["traced"])
+    return {name: _range(varied[name], getattr(config, name), hints[name] is int) for name in names}
 
 
-def _range(how: str, value: float, integer: bool) -> Range:
-    match how:
+def _range(varied: str, value: float, integer: bool) -> Range:
+    match varied:
         case "triple":
-            return Range(max(1, value // 3) if integer else value / 3, 3 * value, True, integer)
+            low = max(1, value // 3) if integer else value / 3
+            return Range(low, 3 * value, log=True, integer=integer)
         case "one_more_or_less":
-            return Range(max(1, value - 1), value + 1, False, True)
+            return Range(max(1, value - 1), value + 1, log=False, integer=True)
         case "tenth_to_one":
-            return Range(0.1, 1.0, False, False)
-    raise ValueError(f"varied must be triple, one_more_or_less or tenth_to_one; got {how!r}.")
+            return Range(0.1, 1.0, log=False, integer=False)
+    raise ValueError(f"varied must be triple, one_more_or_less or tenth_to_one; got {varied!r}.")
 
 
 def draw_value(key: Array, bounds: Range) -> Array:
     """One value, `[]` float32. Integers are drawn uniformly, or log-uniformly and rounded."""
-    low, high = (bounds.low - 0.5, bounds.high + 0.5) if bounds.integer else bounds[:2]
+    low, high = bounds.low, bounds.high
+    if bounds.integer:  # so that rounding gives each integer its share
+        low, high = low - 0.5, high + 0.5
     if bounds.log:
         value = jnp.exp(jax.random.uniform(key, minval=math.log(low), maxval=math.log(high)))
     else:
@@ -104,22 +107,24 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
       ConfigError: if no option has `varied` set.
     """
     ranges = ranges_of(config)
-    shapes: list[tuple[int, int]] = []  # (depth, room for hidden units) of each variant, ascending
+    shapes: list[tuple[int, int]] = []  # layers and hidden units of each variant, ascending
     agent = make(config)
     if "hidden_size" in ranges:
-        depths = range(int(ranges["num_layers"].low), int(ranges["num_layers"].high) + 1)
-        shapes = [(x, size) for x in depths for size in hidden_sizes(ranges["hidden_size"], x)]
-    room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
-    sizes = [{"num_layers": depth, "hidden_size": size} for depth, size in shapes] or [{}]
-    variants = [make(dataclasses.replace(config, **room, **change)) for change in sizes]
+        depths = ranges["num_layers"]
+        for layers in range(int(depths.low), int(depths.high) + 1):
+            shapes += [(layers, size) for size in hidden_sizes(ranges["hidden_size"], layers)]
+    networks = [{"num_layers": layers, "hidden_size": size} for layers, size in shapes] or [{}]
+    batch = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
+    variants = [make(dataclasses.replace(config, **batch, **network)) for network in networks]
 
     def draw(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
         drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())
         values = dict(zip(ranges, drawn, strict=True))
         traced = {name: x for name, x in values.items() if name != "num_layers"}
         hparams = with_hparams(variants[0].hparams, traced)
-        depth, units = (values.get(x, jnp.zeros(())) for x in ("num_layers", "hidden_size"))
-        too_small = [(x < depth) | ((x == depth) & (size < units)) for x, size in shapes]
+        depth = values.get("num_layers", jnp.zeros(()))
+        units = values.get("hidden_size", jnp.zeros(()))
+        too_small = [(n < depth) | ((n == depth) & (size < units)) for n, size in shapes]
         return jnp.int32(sum(too_small)), hparams, values  # the smallest that has room
 
     spec = agent.spec
