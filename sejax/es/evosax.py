@@ -72,9 +72,10 @@ class EvosaxConfig(StrategyOptions):
 
         cls, antithetic, optimizer = ALGORITHMS[self.name]
         options: dict[str, Any] = {}
-        if optimizer is not None:
-            adam = optax.adam(self.step_size)
-            options["optimizer"] = adam if optimizer == "adam" else optax.sgd(1.0)
+        if optimizer == "adam":
+            options["optimizer"] = optax.adam(self.step_size)
+        elif optimizer == "sgd":
+            options["optimizer"] = optax.sgd(1.0)
         if self.name == "open_es":
             # evosax computes the next generation's std from the number of the current generation.
             decay = self.noise_std_decay
