@@ -8,7 +8,6 @@ By default they are the agents that the proxy was learned with; agent=NAME takes
 Writes evaluation.csv and .json into out_dir. --print-config prints the configuration alone.
 """
 
-import dataclasses
 import functools
 import itertools
 import json
@@ -22,7 +21,6 @@ from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import require
 from sejax.proxies import header, hub
 from sejax.runs import commands, fresh_agents, runtime
-from sejax.runs.command_config import without_repetitions
 from sejax.runs.fresh_agents import FreshAgentsConfig, World
 
 
@@ -71,19 +69,11 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     runtime.configure_jax()
-    for config in configs_of(overrides):
+    for config in EvaluateConfig.of_sweep(overrides):
         evaluate(config)
 
 
 help_text = functools.partial(commands.help_of, EvaluateConfig, __doc__)
-
-
-def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
-    """The configurations that the overrides describe, with folders of their own."""
-    configs = EvaluateConfig.of_sweep(overrides)
-    if len(configs) > 1:
-        configs = [dataclasses.replace(x, out_dir=x.out_dir or x.default_folder) for x in configs]
-    return without_repetitions(configs)
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -127,4 +117,4 @@ def _train_and_test(config: EvaluateConfig, name: str, world: World, key: str) -
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, configs_of, resumes=False)
+    commands.start(main, help_text, EvaluateConfig.of_sweep, resumes=False)

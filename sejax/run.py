@@ -19,7 +19,6 @@ from pathlib import Path
 from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
 from sejax.runs import commands, runtime, session
-from sejax.runs.command_config import without_repetitions
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
@@ -32,15 +31,10 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a run directory that cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    learn_all(configs_of(overrides))
+    learn_all(LearnConfig.of_sweep(overrides))
 
 
 help_text = functools.partial(commands.help_of, LearnConfig, __doc__)
-
-
-def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
-    """The configuration of each run that the overrides describe, with folders of their own."""
-    return without_repetitions(LearnConfig.of_sweep(overrides))
 
 
 def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
@@ -98,4 +92,4 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text, configs_of)
+    commands.start(main, help_text, LearnConfig.of_sweep)

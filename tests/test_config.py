@@ -134,21 +134,21 @@ def test_commas_outside_of_brackets_and_quotes_make_a_sweep():
 
 
 def test_the_runs_of_a_sweep_have_folders_of_their_own():
-    configs = run.configs_of(["seed=0,1", "es.noise_std=0.03,0.06"])
+    configs = LearnConfig.of_sweep(["seed=0,1", "es.noise_std=0.03,0.06"])
     folders = {str(config.folder) for config in configs}
     assert len(folders) == 4 and all("noise_std" in folder for folder in folders)
-    configs = run.configs_of(["env=cartpole,acrobot", "run_dir=here"])
+    configs = LearnConfig.of_sweep(["env=cartpole,acrobot", "run_dir=here"])
     assert [x.run_dir for x in configs] == ["here/env_cartpole", "here/env_acrobot"]
-    configs = run.configs_of(["run_dir=", "seed=0,1"])  # an empty variable of a shell
+    configs = LearnConfig.of_sweep(["run_dir=", "seed=0,1"])  # an empty variable of a shell
     assert {x.folder.name for x in configs} == {f"cartpole-se-ddqn-s{i}" for i in (0, 1)}
-    assert [x.seed for x in run.configs_of(["seed=0,1", "seed=2,3"])] == [2, 3]
-    folders = [x.out_dir for x in evaluate.configs_of(["proxy=cartpole,acrobot", "seed=1,2"])]
+    assert [x.seed for x in LearnConfig.of_sweep(["seed=0,1", "seed=2,3"])] == [2, 3]
+    folders = [x.out_dir for x in EvaluateConfig.of_sweep(["proxy=cartpole,acrobot", "seed=1,2"])]
     assert folders[1] == "runs/evaluate-cartpole_seed_2" and len({*folders}) == 4
-    (folder, _) = evaluate.configs_of(["proxy=real", "env=acrobot", "seed=1,2"])
+    (folder, _) = EvaluateConfig.of_sweep(["proxy=real", "env=acrobot", "seed=1,2"])
     assert folder.out_dir == "runs/evaluate-real-acrobot_seed_1"
-    configs = evaluate.configs_of(["proxy=a/proxy.safetensors,a/proxy_last.safetensors"])
+    configs = EvaluateConfig.of_sweep(["proxy=a/proxy.safetensors,a/proxy_last.safetensors"])
     assert len({x.out_dir for x in configs}) == 2
-    assert refusal(evaluate.configs_of, ["proxy=runs/a_b,runs/a/b"]).field == "out_dir"
+    assert refusal(EvaluateConfig.of_sweep, ["proxy=runs/a_b,runs/a/b"]).field == "out_dir"
 
 
 # --- preset files ---------------------------------------------------------------------------------

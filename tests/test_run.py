@@ -31,7 +31,7 @@ TINY = [*OWN, "agent.learning_rate=0.5"]
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
 RUN = [sys.executable, "-m", "sejax.run"]
-START = functools.partial(commands.start, run.main, run.help_text, run.configs_of)
+START = functools.partial(commands.start, run.main, run.help_text, LearnConfig.of_sweep)
 
 
 @functools.cache
@@ -117,7 +117,7 @@ def test_seeds_run_one_after_the_other_on_one_executable(
     compiled, compile_ = [], Chunks.compile
     monkeypatch.setattr(Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n)))
     words = ["generations=6", "checkpoint_every=2", "seed=12,13", f"run_dir={tmp_path}"]
-    best = run.learn_all(run.configs_of([*TINY, *words]))
+    best = run.learn_all(LearnConfig.of_sweep([*TINY, *words]))
     assert compiled == [2]
     said = capsys.readouterr().out
     assert all(
@@ -332,8 +332,8 @@ def test_an_interrupt_waits_until_files_are_written():
 def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypatch, capsys):
     words = [*TINY, f"run_dir={tmp_path}/run", "seed=1,2"]
     status, said, _ = ended(monkeypatch, capsys, START, *words, "--print-config")
-    printed = [LearnConfig.of_stored(x) for x in yaml.safe_load_all(said)]
-    assert status == 0 and printed == run.configs_of(words) and not (tmp_path / "run").exists()
+    parsed = [LearnConfig.of_stored(x) for x in yaml.safe_load_all(said)]
+    assert status == 0 and parsed == LearnConfig.of_sweep(words) and not (tmp_path / "run").exists()
 
 
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):

@@ -64,15 +64,14 @@ def to_plain(value: object, group: str | None = None) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def plugin(group: str) -> Any:
-    """A dataclass field with a plugin's configuration; the default is sejax's own first one."""
-    factory = functools.partial(configure, group, {"name": next(iter(registry.BUILT_IN[group]))})
+def plugin(group: str, by_key: bool = False) -> Any:
+    """A dataclass field with a plugin's configuration, or with those of several by keys.
+
+    The default is sejax's own first plugin; by keys there is none.
+    """
+    first = {"name": next(iter(registry.BUILT_IN[group]))}
+    factory: Any = dict if by_key else functools.partial(configure, group, first)
     return dataclasses.field(default_factory=factory, metadata={"plugin": group})
-
-
-def plugins(group: str) -> Any:
-    """A dataclass field with the configurations of several plugins by keys."""
-    return dataclasses.field(default_factory=dict, metadata={"plugin": group})
 
 
 def configure(group: str, values: Any, where: str = "") -> Any:
@@ -137,19 +136,20 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         return cls(**fields)
 
 
-def require_typed(values: Mapping[str, Any], typed: Collection[str] = ()) -> None:
+def require_typed(values: Mapping[str, Any], typed: Mapping[str, Any] | None = None) -> None:
     """Checks that plain values of a file name no code but what the user has typed.
 
     Args:
       values: nested plain values, by the names of fields or groups.
-      typed: each `module:attribute` that may be imported; see `code_in`.
+      typed: nested plain values of the user, whose code may be imported.
 
     Raises:
       ConfigError: for the first field of `NAMES_CODE` that names another one.
     """
     rule = "must be typed, as names in files are never imported"
+    known = code_in(typed or {}).values()
     for name, text in code_in(values).items():
-        if ":" in text and text not in typed:
+        if ":" in text and text not in known:
             use = f"{shortened(text, 60)}, if you trust it"
             raise ConfigError(name.removesuffix(".name"), rule, got=text, use=use)
 

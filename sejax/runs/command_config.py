@@ -23,7 +23,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from sejax import agents, envs
 from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
@@ -31,12 +31,10 @@ from sejax.envs.spec import TaskSpec
 from sejax.ops.files import as_file_name
 from sejax.options import Count, Options, WholeNumber, errors_of, old, registry, require, shortened
 from sejax.options.plain import (
-    code_in,
     flatten,
     from_plain,
     merge,
     plugin,
-    plugins,
     require_typed,
     to_plain,
     unknown_field,
@@ -71,7 +69,7 @@ class CommandConfig(Options, ABC):
     free: ClassVar[Collection[str]] = ()
     granted: ClassVar[Sequence[str]] = ()
 
-    agents: dict[str, AgentConfig] = plugins("agent")
+    agents: dict[str, AgentConfig] = plugin("agent", by_key=True)
     exploration: ExplorationConfig = plugin("exploration")
     training: TrainingConfig = TrainingConfig()
     seed: WholeNumber = 0
@@ -111,18 +109,19 @@ class CommandConfig(Options, ABC):
 
     @classmethod
     def of_sweep(cls, overrides: Sequence[str]) -> list[Self]:
-        """The configuration of each run of a sweep.
+        """The configuration of each run of a sweep, without repetitions.
 
         Each has a folder named by its words: within the folder that the words name, or beside the
         default one.
 
         Raises:
-          ConfigError: as `of_words`.
+          ConfigError: as `of_words`, or if two that differ share a folder.
         """
         by_name = {override.partition("=")[0]: override for override in overrides}
         overrides = [*by_name.values()]  # of words with one name the last counts
-        configs = []
-        for of_run in expand(overrides):
+        runs = expand(overrides)
+        by_folder: dict[Path, Self] = {}
+        for of_run in runs:
             config = cls.of_words(of_run)
             folder = getattr(config, cls.folder_field)
             known = (cls.folder_field,) if folder else cls.named_by
@@ -131,8 +130,13 @@ class CommandConfig(Options, ABC):
             name = name if len(name) <= 120 else hashlib.sha256(name.encode()).hexdigest()[:16]
             if name:
                 folder = f"{folder}/{name}" if folder else f"{config.default_folder}_{name}"
-            configs.append(dataclasses.replace(config, **{cls.folder_field: folder}))
-        return configs
+            elif len(runs) > 1:
+                folder = folder or config.default_folder
+            config = dataclasses.replace(config, **{cls.folder_field: folder})
+            is_first = str(config) == str(by_folder.setdefault(config.folder, config))
+            rule = "must differ for each run in letters or digits"
+            require(is_first, cls.folder_field, rule, got=config.folder)
+        return [*by_folder.values()]
 
     @classmethod
     def of_words(cls, overrides: Sequence[str]) -> Self:
@@ -148,11 +152,10 @@ class CommandConfig(Options, ABC):
         """The layers that words make, by their names; the words themselves are the last one."""
         trees = trees_of(overrides, cls.groups())
         typed = merge(*trees)
-        code = code_in(trees[-1]).values()
-        require_typed(typed, code)
+        require_typed(typed, trees[-1])
         layers = cls.default_layers(typed)
         below = merge(*layers.values())
-        require_typed(below, code)
+        require_typed(below, trees[-1])
         agent_names = names_of(below["agents"])
         return layers | {"typed": merge(*(by_agent(tree, agent_names) for tree in trees))}
 
@@ -231,19 +234,3 @@ class CommandConfig(Options, ABC):
             is_longer = limit is None or limit > least
             rule = f"must exceed {least}, where {shortened(key)} begins to learn"
             require(is_longer, f"{group}.{name}", rule, got=limit, use=4 * least)
-
-
-Config = TypeVar("Config", bound=CommandConfig)
-
-
-def without_repetitions(configs: Sequence[Config]) -> list[Config]:
-    """Configurations without repetitions, each with a folder of its own.
-
-    Raises:
-      ConfigError: if two that differ share a folder.
-    """
-    by_folder = {str(config.folder): config for config in configs}
-    are_apart = len(by_folder) == len({str(config) for config in configs})
-    rule = "must differ for each run in letters or digits"
-    require(are_apart, configs[0].folder_field, rule, got=next(iter(by_folder), ""))
-    return [*by_folder.values()]

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -111,12 +111,12 @@ class LearnConfig(CommandConfig):
             self.require_learning(key, "training", self.training, self.proxy, spec)
 
     @classmethod
-    def of_stored(cls, values: Mapping[str, Any], typed: Collection[str] = ()) -> Self:
+    def of_stored(cls, values: Mapping[str, Any], typed: Mapping[str, Any] | None = None) -> Self:
         """The configuration that `config.yaml` and proxy files hold, as plain values.
 
         Args:
           values: nested plain values. One agent may stand as `agent`.
-          typed: each `module:attribute` that may be imported.
+          typed: nested plain values of the user, whose code may be imported.
 
         Raises:
           ConfigError: for an unknown, missing or bad field, or parts that cannot work together.

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 
 from sejax.ops.files import remove_leftovers, write_text
 from sejax.options import ConfigError
-from sejax.options.plain import code_in, differences
+from sejax.options.plain import differences
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
@@ -93,7 +93,7 @@ class RunDirectory(Store):
         These defaults change no number.
         """
         try:
-            return LearnConfig.of_stored(stored, code_in(self.settings).values()).plain()
+            return LearnConfig.of_stored(stored, self.settings).plain()
         except ConfigError:
             return stored
 
