@@ -92,12 +92,8 @@ class FreshAgentsConfig(CommandConfig):
         names = names_of(typed["agents"])
         hparams = typed.get("agent_hparams")
         is_as_learned = hparams == "as_learned" or (not names and hparams is None)
-        stored = None
-        learned = Tree()
-        with contextlib.suppress(ConfigError):  # loading the proxy raises it later
-            if typed["proxy"] != "real":
-                stored = header.read(str(typed["proxy"]), "proxy").header
-                learned = learned_layer(stored.config)
+        stored = stored_header(str(typed["proxy"]))
+        learned = learned_layer(stored.config) if stored else {}
         if stored and hparams == "as_learned":
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
             are_same = names in ({}, names_of(learned["agents"]))
@@ -115,6 +111,14 @@ class FreshAgentsConfig(CommandConfig):
         known = learned.get("agents", {}) if hparams is None else {}
         of_agents = {key: agent_like(known, key, name) for key, name in names.items()}
         return {"proxy": {"agents": of_agents}}
+
+
+def stored_header(proxy: str) -> header.Header | None:
+    """The header of a proxy's file; None for the real task, or if loading the file will raise."""
+    with contextlib.suppress(ConfigError):
+        if proxy != "real":
+            return header.read(proxy, "proxy").header
+    return None
 
 
 def learned_layer(config: Mapping[str, Any]) -> Tree:
