@@ -48,7 +48,7 @@ class LearnState(struct.PyTreeNode):
     best_score: Array
     best_scores: Float[Array, " agent"]
     best_generation: Array
-    solved: Array  # with stop_when_solved: the run is over; later generations cost nothing
+    solved: Array  # with stop_when_solved: the run is over; later generations train nothing
 
 
 class LearnResult(struct.PyTreeNode):
@@ -192,7 +192,8 @@ def make_learner(
     """
     if config is not None:
         if not callable(getattr(config, "parts", None)) or parts:
-            raise TypeError(f"config must be alone, of sejax.config([...]); got {config!r:.60}.")
+            got = [*parts] or config
+            raise TypeError(f"config must be alone, of sejax.config([...]); got {got!r:.60}.")
         parts = config.parts()
         generations = config.generations if generations is None else generations
     generations = checked(100 if generations is None else generations, Count, "generations", 100)
@@ -272,6 +273,6 @@ def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None
     expected = (strategy.num_candidates, mean.size)
     require(shape == expected, "es", f"must ask for candidates {expected}", got=shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
-    require(least > 0, "es", "must evaluate each candidate and the incumbent", got=least)
+    require(least > 0, "es", "must have num_evals and num_incumbent_evals of 1 or more", got=least)
     is_paired = not strategy.antithetic or shape[0] % 2 == 0
-    require(is_paired, "es", "must be even, as it is antithetic", got=shape[0])
+    require(is_paired, "es", "must ask for candidates in pairs, as antithetic ones", got=shape[0])

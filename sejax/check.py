@@ -193,6 +193,8 @@ def _others(config: CheckConfig, task: Task) -> dict[str, agents.AgentConfig]:
     learned = config.agents
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
+    again = known & {*(config.algorithms or ())}
+    require(not again, "algorithms", "must be none of its own agents", got=", ".join(again))
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in known}
     for key, agent in (learned | others).items():
@@ -239,7 +241,7 @@ def _null(
     keys = dict(zip(uses, jax.random.split(jax.random.key(config.seed), 3), strict=True))
     num_episodes = 2 * ARS["num_directions"] + 1 + ARS["num_tests"]  # of a generation
     generations = max(1, config.null_steps // (num_episodes * task.max_steps))
-    fields = ARS | {"alive_bonus": dict[str, Any](task.origin or {}).get("healthy_reward", 0.0)}
+    fields = ARS | {"alive_bonus": (task.origin or {}).get("healthy_reward", 0.0)}
     search = PolicySearchConfig(**fields, generations=generations, until_solved=True)
     (lesson,), costs = search_policies(search, task, 1, keys, store, config.devices)
     method = "a random search"
@@ -260,12 +262,15 @@ def _trained(config: CheckConfig, rows: Rows, store: Store, pool: Pool) -> pd.Da
     tables = []
     for row, (world, keys) in rows.items():
         names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
-        missing = [key for key, name in names.items() if store.get(name) is None]
+        entries = {key: store.get(name) for key, name in names.items()}
+        results = {key: entry[0] for key, entry in entries.items() if entry is not None}
+        missing = [key for key in names if key not in results]
         print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
-        results = iter(pool(fresh_agents.train, [(config, world, key) for key in missing]))
-        for key, name in names.items():
-            columns = store.once(name, functools.partial(next, results))
-            tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
+        jobs = [(config, world, key) for key in missing]
+        for key, columns in zip(missing, pool(fresh_agents.train, jobs), strict=True):
+            store.put(names[key], columns)
+            results[key] = columns
+        tables += [pd.DataFrame({"world": row, "agent": x, **results[x]}) for x in names]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -329,10 +334,10 @@ def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
     """
     learning = zoo.describe(header.read(proxy.path)).learning
     record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json
-    with contextlib.suppress(OSError, ValueError):
-        record = record or json.loads(proxy.path.with_name("run.json").read_text())
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        record = record or dict(json.loads(proxy.path.with_name("run.json").read_text()))
     cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
-    if cost:
+    if "real_steps" in cost:
         steps, returns = summary["train_steps_mean"], summary["test_return_mean"]
         saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if proxy.env.is_real else 0)
         pays = saved > 0 and reaches(returns[OWN], float(proxy.task.solved_reward))

@@ -218,7 +218,7 @@ def make_evaluator(
     """Builds `evaluate(key, env_params, active=True, test_params=None) -> Outcome`.
 
     A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
-    `training.test_episodes` episodes on the task. With `active=False` nothing is computed. Varied
+    `training.test_episodes` episodes on the task. With `active=False` no step is taken. Varied
     hyperparameters of the agent are drawn first, from the same key. `test_params` are the params of
     the test episodes; default: the task's.
 
@@ -248,11 +248,10 @@ def make_evaluator(
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_agent(agent, task.observation, task.action)
     require_part("training", TrainingConfig, training)
-    # An agent may never end a test. A training of less than 1,000 steps is a trial.
-    steps = task.max_steps
+    # A test may last to the task's limit, which must not dwarf the training, or 1,000 steps.
     most = 1000 * max(training.max_steps or LARGEST, 1000)
     rule = f"must be at most {most:,}"
-    require(steps <= most, "env.max_steps", rule, got=f"{steps:,}", use=1000)
+    require(task.max_steps <= most, "env.max_steps", rule, got=f"{task.max_steps:,}", use=1000)
 
     def make_run(agent: Agent) -> Callable[..., Outcome]:
         test = make_tester(agent, task, training.test_episodes, test_env)
@@ -301,7 +300,9 @@ def make_tested_trainer(
     """
     if training.stop_rule == "solved" and not task.is_solvable:  # tests would end no training
         training = dataclasses.replace(training, stop_rule="never")
-    test = make_tester(agent, task, max(1, training.tests_after_each))
+    if not training.tests_after_each:
+        return make_trainer(agent, env, training, task.solved_reward, **options)
+    test = make_tester(agent, task, training.tests_after_each)
 
     def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:
         tests = test(key, agent_state, active)

@@ -11,7 +11,6 @@ configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
-import contextlib
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,27 +56,27 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
         program = str(config.plain() | {"seed": 0, "run_dir": None})
         by_program.setdefault(program, []).append(config)
     # The last run of a sweep must not be refused after the others have run.
+    for config in configs:
+        with RunDirectory(config):
+            pass
+    runtime.configure_jax()
     if len(by_program) > 1:
         for config, *_ in by_program.values():
             make_bilevel(**config.parts())
     scores = dict[Path, float]()
     diverged = list[Path]()
     for of_program in by_program.values():
-        with contextlib.ExitStack() as machines:
-            chunks = None
+        with of_program[0].machines.make(of_program[0]) as chunks:
             for config in of_program:
+                progress = RunProgress(config)
                 with RunDirectory(config) as directory:
-                    progress = RunProgress(config)
-                    if chunks is None:
-                        runtime.configure_jax()
-                        chunks = machines.enter_context(config.machines.make(config))
                     summary = session.run(config, directory, chunks, progress)
                     score = max(float(row["best_so_far"]) for row in directory.rows)
-                    scores[config.folder] = score
                     if summary["ended"] == "diverged":
                         diverged.append(directory.folder)
                     elif len(configs) == 1:
                         progress.finish(directory, chunks.bilevel, score)
+                    scores[config.folder] = score
     if len(configs) > 1:
         print("Best scores of the search mean:")
         for config in configs:

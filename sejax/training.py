@@ -41,7 +41,7 @@ class TrainingConfig(Options):
       max_episodes: n_e: most episodes of a training
       min_steps: Training steps before the stop rule may end a training.
       max_steps: Training ends after this many steps, whatever the stop rule says.
-      stop_rule: plateau (SEs), solved (real tasks)
+      stop_rule: plateau (SEs), solved (real tasks), or never
       window: d: episodes in each of the two means that the plateau rule compares
       plateau_tolerance: C_diff: relative change between them that counts as flat
       solved_by: test or train: whose mean return of the last d episodes must reach the solved
@@ -175,7 +175,7 @@ def make_trainer(
 
     `train` is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
     agents takes as many steps as its longest training, without copies of replay buffers. With
-    `active=False` nothing is computed.
+    `active=False` no step is taken.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
@@ -358,23 +358,33 @@ class _Loop:
         large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
         stored, _ = large
         key, _ = consts
-        is_full = state.step == first_step + buffer.learns_every
         # Keys of the last step, which did not learn.
         keys = _StepKeys(*step_keys(key, state.step - 1, 6))
-        agent_state = self.learn(buffer, stored, None, state.step, keys, state, is_full)
+        is_full = state.step == first_step + buffer.learns_every
+        agent_state = self.learn(state, buffer, stored, state.step, keys, is_due=is_full)
         return large, state.replace(agent_state=agent_state)
 
     def learn(
         self,
+        state: _LoopState,
         buffer: Buffer,
         stored: PyTree,
-        transition: Transition | None,
         num_steps: Array,
         keys: _StepKeys,
-        state: _LoopState,
+        transition: Transition | None = None,
         is_due: Array | bool = True,
     ) -> AgentState:
-        """One update after `num_steps`, of which the last made `transition`; of a rollout None."""
+        """One update of the agent, if it is due.
+
+        Args:
+          state: of the loop.
+          buffer: what the agent learns from.
+          stored: the buffer's arrays.
+          num_steps: steps so far.
+          keys: of the last step.
+          transition: the last step's; None after a rollout, which has stored it.
+          is_due: whether the agent learns now, if its episodes of warm-up are over.
+        """
 
         def update(agent_state: AgentState) -> AgentState:
             in_use = self.agent.batch_size(agent_state)
@@ -414,15 +424,15 @@ class _Loop:
         stored = buffer.store(stored, state.step, transition, ended, active)
         agent_state = state.agent_state
         if learns:
-            agent_state = self.learn(buffer, stored, transition, state.step + 1, keys, state)
+            agent_state = self.learn(state, buffer, stored, state.step + 1, keys, transition)
         train_steps = state.train_steps + info.get("sejax_num_steps", 1)
         # The episode's row of the curve; one that is out of range is dropped.
         row = jnp.where(finished, state.episode, self.training.max_episodes)
-        entries = {"returns": state.episode_return + reward, "episode_ends": train_steps}
+        episode_return = state.episode_return + reward
         state = state.replace(
             step=state.step + 1,
             train_steps=train_steps,
-            episode_return=entries["returns"],
+            episode_return=episode_return,
             obs=next_obs,
             env_state=env_state,
             agent_state=agent_state,
@@ -432,6 +442,7 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
         )
+        entries = {"returns": episode_return, "episode_ends": train_steps}
         entries["test_returns"] = state.tested
         curve = {name: x.at[row].set(entries[name], mode="drop") for name, x in curve.items()}
         return (stored, curve), state

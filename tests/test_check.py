@@ -147,6 +147,7 @@ def test_a_reward_network_is_judged_by_training_steps(tmp_path):
 @pytest.mark.parametrize(("fields", "field"), [
     ({"proxy": "nope"}, "proxy"), ({"proxy": "real"}, "proxy"), ({"agent": "ddqn"}, "agent"),
     ({"algorithms": "[td3]"}, "algorithms"), ({"num_agents": 4}, "num_agents"),
+    ({"algorithms": "[q_learning]"}, "algorithms"),
     ({"baseline": "false"}, "baseline"), ({"agent_hparams": "varied"}, "agent_hparams"),
 ])  # fmt: skip
 def test_what_cannot_be_judged_is_refused(fields, field, whole, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import pytest
 import yaml
-from support import ROOM, ended, is_drawn, refused
+from support import ROOM, ended, is_drawn, refusal, refused
 from support import metrics as rows
 
 import sejax
@@ -119,11 +119,8 @@ def test_seeds_run_one_after_the_other_on_one_executable(
     words = ["generations=6", "checkpoint_every=2", "seed=12,13", f"run_dir={tmp_path}"]
     best = run.learn_all(LearnConfig.of_sweep([*TINY, *words]))
     assert compiled == [2]
-    said = capsys.readouterr().out
-    assert all(
-        f"{tmp_path}/seed_{seed}" in said.split("Best scores of the search mean:")[1]
-        for seed in (12, 13)
-    )
+    scores = capsys.readouterr().out.partition("Best scores of the search mean:")[2]
+    assert all(f"{tmp_path}/seed_{seed}" in scores for seed in (12, 13))
     assert {path.name for path in tmp_path.iterdir()} == {"seed_12", "seed_13"}
     for seed, score in zip((12, 13), best, strict=True):
         folder = tmp_path / f"seed_{seed}"
@@ -132,6 +129,8 @@ def test_seeds_run_one_after_the_other_on_one_executable(
         record = sejax.load_proxy(folder).record
         assert record["seed"] == seed and record["score"] == pytest.approx(score)
     assert rows(tmp_path / "seed_12") == rows(uninterrupted)
+    other = LearnConfig.of_sweep([*TINY, "seed=11,13", f"run_dir={tmp_path}", "es.noise_std=0.5"])
+    assert refusal(run.learn_all, other).field == "run_dir" and not (tmp_path / "seed_11").exists()
 
 
 # --- trackers ------------------------------------------------------------------------------------

@@ -139,7 +139,6 @@ def adam_step(
       columns: a batch, and other arrays with the same columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
     """
-
     total = sum_over_batch(
         lambda columns: jax.grad(sum_of_losses)(params, *columns), columns, hparams.batch_size
     )

@@ -55,7 +55,7 @@ def ranges_of(config: AgentConfig) -> dict[str, Range]:
     rule = f"must be default, as {cls.__name__} varies nothing or half a network"
     require(is_whole, "agent_hparams", rule, got="varied", use="default")
     # Traced options first: the order decides which key draws which option.
-    names = sorted(varied, key=lambda name: not marks_of[name]["traced"])
+    names = sorted(varied, key=lambda name: not marks_of[name].get("traced"))
     return {name: _range(varied[name], getattr(config, name), hints[name] is int) for name in names}
 
 

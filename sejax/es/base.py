@@ -27,7 +27,7 @@ class Strategy:
       tell: `(key, population, scores [pop], incumbent_score [], state) -> state`; higher scores are
         better, and scores that are not finite rank worst.
       incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
-      num_candidates: vectors that `ask` returns; NES, of n_p perturbations, asks for 2 n_p.
+      num_candidates: vectors that `ask` returns; NES with mirrored perturbations asks for 2 n_p.
       antithetic: whether the second half of the population mirrors the first at the incumbent.
       num_evals: evaluations of each candidate, each with a fresh agent.
       eval_aggregate: how the scores of a candidate's evaluations become one score.

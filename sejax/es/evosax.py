@@ -58,7 +58,9 @@ class EvosaxConfig(StrategyOptions):
         super().__post_init__()
         require_known("es.name", self.name, ALGORITHMS)
         size = self.population_size
-        require(size % 2 == 0, "es.population_size", "must be even", got=size, use=size + 1)
+        _, is_antithetic, _ = ALGORITHMS[self.name]
+        is_fit = size % 2 == 0 or not is_antithetic
+        require(is_fit, "es.population_size", "must be even", got=size, use=size + 1)
         algorithms_with = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
         for name, algorithms in algorithms_with.items():
             value = getattr(self, name)

@@ -115,8 +115,8 @@ def spread_groups_over_devices(
     Returns:
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
-    checked(num_devices, Count, "devices", None)
-    checked(num_parallel, Count, "num_parallel", None)
+    num_devices = checked(num_devices, Count, "devices", None)
+    num_parallel = checked(num_parallel, Count, "num_parallel", None)
     available = jax.device_count()
     is_fit = num_devices is None or num_devices <= available
     require(is_fit, "devices", f"must be at most {available}", got=num_devices, use="null")

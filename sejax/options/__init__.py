@@ -275,6 +275,12 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         problem = error.errors()[0]
         if typing.get_origin(hint) is Literal:
             raise unknown_name(name, str(got), typing.get_args(hint)) from None
+        if isinstance(got, Mapping):
+            rule = "must have no fields"
+            raise ConfigError(name, rule, got=got, fix="Leave them out.") from None
+        if problem["type"] == "tuple_type":
+            use = f"[{shortened(got, 20)}]"
+            raise ConfigError(name, "must be a list in brackets", got=repr(got), use=use) from None
         rule = problem["msg"].replace("Input should", "must").partition(", unable")[0]
         for bound, words in (("ge", "at least"), ("le", "at most")):
             if bound in problem.get("ctx", {}):
@@ -285,11 +291,6 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         rule = f"must be {'' if isinstance(converted, bool) else 'no '}true or false"
     is_open = default is dataclasses.MISSING or dataclasses.is_dataclass(default)
     use = "VALUE" if is_open else as_text(default)
-    if isinstance(got, Mapping):
-        raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.")
-    if rule == "must be a valid tuple":
-        rule = "must be a list in brackets"
-        use = f"[{shortened(got, 20)}]"
     raise ConfigError(name, rule, got=repr(got), use=use)
 
 
@@ -307,10 +308,7 @@ def require_known(field: str, value: object, known: Collection[str]) -> None:
 
 
 def marks(cls: type, name: str) -> dict[str, Any]:
-    """The metadata of a field; a subclass inherits the marks that it does not set.
-
-    So a subclass may change a default alone.
-    """
+    """The metadata of a field; a subclass that gives a default without `option` inherits them."""
     fields = (vars(base).get("__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return dict(ChainMap(*(dict(field.metadata) for field in fields if field is not None)))
 

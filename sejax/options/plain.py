@@ -101,8 +101,8 @@ def configure(group: str, values: Any, where: str = "") -> Any:
     for field in [name for name in fields if name not in known]:
         built_in = registry.BUILT_IN[group]
         others = [x for x in built_in if field in defaults_of(registry.find(group, x))]
-        message = f"is a field of {where}={', '.join(others)}. Set one of them."
-        require(not others, f"{where}.{field}", message)
+        rule = f"is no field of {values['name']}, but of {group}={', '.join(others)}."
+        require(not others, f"{where}.{field}", rule)
     return from_plain(cls, fields, where)
 
 

@@ -152,8 +152,7 @@ def chosen_agents(values: Mapping[str, Any]) -> Tree:
 
 def names_of(agents: Mapping[str, Any]) -> dict[str, str]:
     """The names of the chosen agents by their keys."""
-    named = {key: x for key, x in agents.items() if isinstance(x, Mapping) and "name" in x}
-    return {key: str(x["name"]) for key, x in named.items()}
+    return {k: str(x["name"]) for k, x in agents.items() if isinstance(x, Mapping) and "name" in x}
 
 
 def drop_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
