@@ -138,7 +138,7 @@ class Bilevel:
         # XLA must not fuse the sums below into the program of the outcome: they would round
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
-        compared, mean_score = self.scoring.for_strategy(outcome)
+        compared, mean_score = self.scoring.compared(outcome)
         es_state = self.layout.strategy.tell(
             candidates.key_tell, candidates.population, compared, mean_score, candidates.es_state
         )

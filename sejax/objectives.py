@@ -75,7 +75,7 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def compared(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that compare candidates; nan for diverged agents.
 
         Raises:

@@ -77,14 +77,14 @@ class Scoring:
     objective: Objective
     layout: Layout
 
-    def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+    def compared(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
 
         Args:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
         layout = self.layout
-        scores = self._scores(self.objective(outcome))
+        scores = self._scores(self.objective.compared(outcome))
         aggregate = jnp.mean if layout.strategy.eval_aggregate == "mean" else jnp.min
         by_candidate = scores.population.reshape(-1, layout.strategy.num_evals)
         population = aggregate(by_candidate, axis=1)  # nan if the agent of one evaluation diverged

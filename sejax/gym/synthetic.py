@@ -64,8 +64,8 @@ class SyntheticWorld:
         self._start_layers = networks.network_layers(weights, "start")
         heads = [networks.network_layers(weights, name) for name in units if name != "start"]
         self._layers = networks.joined(heads)
-        rule = "must draw initial states; got None. Set RealTask(starts=...)."
-        require(self.draws_noise or task.starts, "task.starts", rule)
+        are_known = self.draws_noise or task.starts
+        require(are_known, "task.starts", "must draw initial states. Set RealTask(starts=...).")
         self._starts: Any = task.starts  # not None where it is called
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 

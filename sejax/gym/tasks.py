@@ -105,8 +105,7 @@ def real_env(header: Header, **options: Any) -> Env:
     require(is_known, "task", rule, got=config, use=use)
     if name in GRIDS:
         mode = options.get("render_mode")
-        rule = "must be None, as grid worlds have no picture"
-        require(mode is None, "render_mode", rule, got=mode, fix="Leave it out.")
+        require(mode is None, "render_mode", "must be None in grid worlds", got=mode, use="None")
         return gymnasium.wrappers.TimeLimit(GridWorld(name, **fields), limit)
     return gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=limit, **options, **fields)
 

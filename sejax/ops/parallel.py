@@ -205,8 +205,8 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
 
             return map_in_batches(run, min(width or size, size), varied)
 
-        # Under a second `vmap` the maps run one after the other.
-        out = in_batches_on_cpu(all_of_them, width and 1)(*args)
+        outer_width = None if width is None else 1  # under a second `vmap` maps follow one another
+        out = in_batches_on_cpu(all_of_them, outer_width)(*args)
         return out, jax.tree.map(lambda _: True, out)
 
     return lambda *args: one(args) if on_cpu() else fn(*args)

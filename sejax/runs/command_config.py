@@ -133,9 +133,8 @@ class CommandConfig(Options, ABC):
             elif len(runs) > 1:
                 folder = folder or config.default_folder
             config = dataclasses.replace(config, **{cls.folder_field: folder})
-            is_first = str(config) == str(by_folder.setdefault(config.folder, config))
-            rule = "must differ for each run in letters or digits"
-            require(is_first, cls.folder_field, rule, got=config.folder)
+            is_same = str(by_folder.setdefault(config.folder, config)) == str(config)
+            require(is_same, cls.folder_field, "must differ for each run", got=config.folder)
         return [*by_folder.values()]
 
     @classmethod

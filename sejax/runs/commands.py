@@ -55,7 +55,7 @@ def start(
                 stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
-        Path.cwd()
+        Path.cwd()  # raises if the folder is gone
         runtime.configure_xla(_devices(overrides))  # before a plugin starts jax's devices
         if {*HELP} & {*words}:
             print(help_text(overrides))
@@ -89,8 +89,8 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
     classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]
     sources = dict[str, str]()
-    for layer, tree in layers.items():
-        sources |= dict.fromkeys(config.named(tree), "" if layer == "default" else f" ({layer})")
+    for layer, values in layers.items():
+        sources |= dict.fromkeys(config.named(values), "" if layer == "default" else f" ({layer})")
     named = (*choices, *map(config.field_of, config.agents))
     fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
     return "\n".join([*lines, field_lines(fields, classes, sources)])

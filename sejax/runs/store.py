@@ -76,8 +76,8 @@ class Store:
         except (OSError, ValueError, NotImplementedError) as error:
             is_used = isinstance(error, filelock.Timeout)
             why = "which another process uses" if is_used else shortened(error)
-            rule = "must be a folder that can be written"
-            raise self.refused(f"{rule}; got {shortened(self.folder)}, {why}") from error
+            got = f"{shortened(self.folder)}, {why}"
+            raise self.refused(f"must be a folder that can be written; got {got}") from error
         return self
 
     def __exit__(self, *_: object) -> None:

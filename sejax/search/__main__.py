@@ -36,8 +36,7 @@ def main(overrides: Sequence[str]) -> None:
         study.report(current, plan)
     except study.UNUSABLE as error:
         got = f"{plan.folder / 'study.db'} ({told(error.__cause__ or error)})"
-        rule = f"must hold a database that can be used; got {got}"
-        raise ConfigError("search_dir", rule, use="FOLDER") from error
+        raise ConfigError("search_dir", f"must hold a database; got {got}", use="FOLDER") from error
 
 
 def help_text(overrides: Sequence[str]) -> str:

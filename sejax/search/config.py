@@ -55,7 +55,7 @@ class StudyConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = self.min_generations, self.max_generations
-        rule = "must be at least min_generations"
+        rule = f"must be at least min_generations={low}"
         require(high >= low, "max_generations", rule, got=high, use=9 * low)
 
     @property
