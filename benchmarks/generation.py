@@ -149,7 +149,7 @@ def sejax_side(args: argparse.Namespace) -> None:
     state = jax.jit(bilevel.init)(jax.random.key(args.seed))
     generation = jax.jit(bilevel.generation, compiler_options=compiler_options())
     compiled, start = common.measure(lambda: generation.lower(state).compile())
-    weights = jax.tree.map(lambda x: np.asarray(x).tolist(), bilevel.unravel(state.incumbent))
+    weights = jax.tree.map(lambda x: np.asarray(x).tolist(), bilevel.unravel(state.last.weights))
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         (_, info), times = common.measure(lambda: jax.block_until_ready(compiled(state)))

@@ -10,6 +10,7 @@ Source: paper, Algorithm 1.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -35,19 +36,23 @@ from sejax.scoring import GenerationInfo, Scoring
 from sejax.training import TrainingConfig
 
 
+class ScoredProxy(struct.PyTreeNode):
+    """An incumbent, and what the generation that measured it found."""
+
+    weights: Float[Array, " dims"]
+    score: Array  # `Scores.incumbent_mean`, or -inf
+    by_agent: Float[Array, " agent"]  # `Scores.agent_means`, or -inf
+    generation: Array  # int32; -1 if none has measured it
+
+
 class LearnState(struct.PyTreeNode):
     """What the next generation needs, and the best proxy so far."""
 
     key: Array
     es_state: StrategyState
     generation: Array
-    incumbent: Float[Array, " dims"]  # measured by the last generation, before its update
-    incumbent_score: Array  # `Scores.incumbent_mean`, or -inf
-    incumbent_scores: Float[Array, " agent"]  # `Scores.agent_means`, or -inf
-    best: Float[Array, " dims"]
-    best_score: Array
-    best_scores: Float[Array, " agent"]
-    best_generation: Array
+    last: ScoredProxy  # the incumbent of the last generation, before its update
+    best: ScoredProxy
     solved: Array  # with stop_when_solved: the run is over; later generations train nothing
 
 
@@ -87,18 +92,18 @@ class Bilevel:
         """The state before the first generation, with random weights of the proxy."""
         key_weights, key_es, key_run = jax.random.split(key, 3)
         mean, _ = ravel_pytree(self.proxy.init_weights(key_weights))
-        unknown = jnp.full(self.layout.mixture.size, -jnp.inf)
+        start = ScoredProxy(
+            weights=mean,
+            score=jnp.float32(-jnp.inf),
+            by_agent=jnp.full(self.layout.mixture.size, -jnp.inf),
+            generation=jnp.int32(-1),
+        )
         state = LearnState(
             key=key_run,
             es_state=self.layout.strategy.init(key_es, mean),
             generation=jnp.int32(0),
-            incumbent=mean,
-            incumbent_score=jnp.float32(-jnp.inf),
-            incumbent_scores=unknown,
-            best=mean,
-            best_score=jnp.float32(-jnp.inf),
-            best_scores=unknown,
-            best_generation=jnp.int32(-1),
+            last=start,
+            best=start,
             solved=jnp.bool_(False),
         )
         return copy_to_devices(state, self.evaluate.devices)
@@ -143,24 +148,23 @@ class Bilevel:
             candidates.key_tell, candidates.population, compared, mean_score, candidates.es_state
         )
         scores = self.scoring.reported(outcome)
-        score = or_minus_inf(scores.incumbent_mean)
-        agent_means = or_minus_inf(scores.agent_means)
-        is_best = (score >= state.best_score) & jnp.isfinite(score)
+        measured = ScoredProxy(
+            weights=candidates.incumbent,
+            score=or_minus_inf(scores.incumbent_mean),
+            by_agent=or_minus_inf(scores.agent_means),
+            generation=state.generation,
+        )
+        is_best = (measured.score >= state.best.score) & jnp.isfinite(measured.score)
         after = state.replace(
             es_state=es_state,
             generation=state.generation + 1,
-            incumbent=candidates.incumbent,
-            incumbent_score=score,
-            incumbent_scores=agent_means,
-            best=jnp.where(is_best, candidates.incumbent, state.best),
-            best_score=jnp.where(is_best, score, state.best_score),
-            best_scores=jnp.where(is_best, agent_means, state.best_scores),
-            best_generation=jnp.where(is_best, state.generation, state.best_generation),
-            solved=state.solved | self.ends_run(score),
+            last=measured,
+            best=jax.tree.map(partial(jnp.where, is_best), measured, state.best),
+            solved=state.solved | self.ends_run(measured.score),
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved
-        return after, self.scoring.info(scores, outcome, state.generation, after.best_score, active)
+        return after, self.scoring.info(scores, outcome, state.generation, after.best.score, active)
 
 
 def make_learner(
@@ -202,10 +206,10 @@ def make_learner(
     def learn(key: Array) -> LearnResult:
         state, info = bilevel.generations(bilevel.init(key), generations)
         return LearnResult(
-            weights=bilevel.unravel(state.best),
-            score=state.best_score,
-            generation=state.best_generation,
-            last_weights=bilevel.unravel(state.incumbent),
+            weights=bilevel.unravel(state.best.weights),
+            score=state.best.score,
+            generation=state.best.generation,
+            last_weights=bilevel.unravel(state.last.weights),
             info=info,
         )
 

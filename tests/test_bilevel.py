@@ -82,8 +82,8 @@ def test_a_generation_measures_the_incumbent_and_then_moves_it(one_device):
     for number, ((before, after), info) in enumerate(
         zip(itertools.pairwise(states), infos, strict=True)
     ):
-        np.testing.assert_array_equal(after.incumbent, before.es_state.mean)
-        np.testing.assert_array_equal(after.incumbent_score, info.incumbent_mean)
+        np.testing.assert_array_equal(after.last.weights, before.es_state.mean)
+        np.testing.assert_array_equal(after.last.score, info.incumbent_mean)
         # All Better 2 moves the mean exactly if a member beats the incumbents' mean.
         moves.append(bool((after.es_state.mean != before.es_state.mean).any()))
         assert moves[-1] == bool(info.population_max > info.incumbent_mean)
@@ -101,8 +101,8 @@ def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
         best_so_far = [info.best_so_far for info in infos]
         np.testing.assert_allclose(best_so_far, np.maximum.accumulate(means))
         best = max(range(len(means)), key=lambda i: (means[i], i))
-        assert states[-1].best_generation == best and states[-1].best_score == means[best]
-        np.testing.assert_array_equal(states[-1].best, states[best + 1].incumbent)
+        assert states[-1].best.generation == best and states[-1].best.score == means[best]
+        np.testing.assert_array_equal(states[-1].best.weights, states[best + 1].last.weights)
 
 
 def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
@@ -149,10 +149,10 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
 def assert_result_equals_run(result, program, states, infos, **tolerance):
     history = jax.tree.map(lambda *x: jnp.stack(x), *infos)
     last = states[-1]
-    expected = (program.unravel(last.best), program.unravel(last.incumbent), history)
+    expected = (program.unravel(last.best.weights), program.unravel(last.last.weights), history)
     assert_close((result.weights, result.last_weights, result.info), expected, **tolerance)
-    assert result.generation == last.best_generation
-    assert_close(result.score, last.best_score, **tolerance)
+    assert result.generation == last.best.generation
+    assert_close(result.score, last.best.score, **tolerance)
 
 
 def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(room):
@@ -223,8 +223,8 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
     broken = states[0].replace(es_state=es_state.replace(mean=jnp.nan * es_state.mean))
     after, info = generation(broken)
     assert info.num_nonfinite == 12
-    assert after.incumbent_score == -jnp.inf and after.best_generation == -1
-    np.testing.assert_array_equal(after.best, states[0].best)
+    assert after.last.score == -jnp.inf and after.best.generation == -1
+    np.testing.assert_array_equal(after.best.weights, states[0].best.weights)
 
 
 def test_generations_beside_a_configuration_win():

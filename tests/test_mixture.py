@@ -181,8 +181,8 @@ def test_a_generation_tells_the_advantages_over_each_agents_incumbent(two):
     )  # fmt: skip
     np.testing.assert_allclose(after.es_state.mean, told.mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(two.info.incumbent_mean, np.mean(means), rtol=1e-6)
-    np.testing.assert_allclose(after.best_scores, means, rtol=1e-6)
-    np.testing.assert_allclose(after.incumbent_scores, means, rtol=1e-6)
+    np.testing.assert_allclose(after.best.by_agent, means, rtol=1e-6)
+    np.testing.assert_allclose(after.last.by_agent, means, rtol=1e-6)
 
 
 def test_the_columns_of_each_agent_are_means_over_its_trainings(two):
@@ -222,10 +222,10 @@ def test_a_run_stops_when_the_incumbents_score_solves_the_task(aggregate, score)
     incumbents = TASK.solved_reward + np.array([0.75, -0.25])
     after, info = told(incumbents, aggregate=aggregate)
     assert bool(after.solved) == (aggregate == "mean")
-    np.testing.assert_allclose(after.best_score, TASK.solved_reward + score, rtol=1e-6)
+    np.testing.assert_allclose(after.best.score, TASK.solved_reward + score, rtol=1e-6)
     np.testing.assert_allclose(info.by_agent.incumbent_mean, incumbents, rtol=1e-6)
     after, _ = told(incumbents + 1, stop_when_solved=False)
-    assert not after.solved and after.best_score > TASK.solved_reward
+    assert not after.solved and after.best.score > TASK.solved_reward
 
 
 def test_the_incumbents_agents_that_diverged_rank_last_within_their_agent():
@@ -243,6 +243,6 @@ def test_a_candidate_of_infinite_score_is_counted_and_no_maximum():
 @pytest.mark.parametrize("aggregate", ["mean", "min"])
 def test_an_incumbent_that_one_agent_never_survived_is_never_the_best(aggregate):
     after, info = told([1e6, NAN], aggregate=aggregate)
-    assert (after.best_generation, after.best_score, after.solved) == (-1, -INF, False)
-    np.testing.assert_array_equal(after.incumbent_scores, [1e6, -INF])
+    assert (after.best.generation, after.best.score, after.solved) == (-1, -INF, False)
+    np.testing.assert_array_equal(after.last.by_agent, [1e6, -INF])
     np.testing.assert_array_equal(info.by_agent.num_nonfinite, [0, 1])

@@ -94,7 +94,7 @@ def _begin(seed: int, directory: RunDirectory, chunks: Chunks, report: RunProgre
         if there != here:
             report.say(f"It was made with {there}; here are {here}. Numbers may move.")
         # `stop_when_solved` may have changed.
-        solved = jax.numpy.bool_(chunks.bilevel.ends_run(restored.best_score))
+        solved = jax.numpy.bool_(chunks.bilevel.ends_run(restored.best.score))
         state = dataclasses.replace(restored, solved=solved)
         save_proxies(directory, chunks.bilevel, jax.device_get(state), 0)
     # A copy has its own buffers, which can be donated.
@@ -153,34 +153,33 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
     Raises:
       OSError: if a file cannot be written.
     """
-    if state.best_generation < 0:
+    if state.best.generation < 0:
         return
-    best = state.best, state.best_score, state.best_scores, state.best_generation
-    last = state.incumbent, state.incumbent_score, state.incumbent_scores, state.generation - 1
     agent = bilevel.layout.mixture.agents[0]
     names = bilevel.layout.mixture.names
     discount: Any = agent.discount(agent.hparams)  # `save` takes an array of one number too
     # A proxy does not depend on the tracker, nor on the machines.
     config = {k: v for k, v in directory.settings.items() if k not in ("tracker", "machines")}
-    for name, (flat, score, scores, generation) in {"proxy": best, "proxy_last": last}.items():
+    for name, scored in {"proxy": state.best, "proxy_last": state.last}.items():
         path = directory.folder / f"{name}.safetensors"
-        if (generation < first and path.exists()) or not np.isfinite(flat).all():
+        generation = int(scored.generation)
+        if (generation < first and path.exists()) or not np.isfinite(scored.weights).all():
             continue
-        record = {"score": float(score), "generation": int(generation), "seed": config["seed"]}
+        record = {"score": float(scored.score), "generation": generation, "seed": config["seed"]}
         if len(names) > 1:
-            record["scores"] = dict(zip(names, map(float, scores), strict=True))
-        save(path, bilevel.proxy, bilevel.unravel(flat), config, discount, **record)
+            record["scores"] = dict(zip(names, map(float, scored.by_agent), strict=True))
+        save(path, bilevel.proxy, bilevel.unravel(scored.weights), config, discount, **record)
 
 
 def _summary(directory: RunDirectory, bilevel: Bilevel, state: LearnState) -> dict[str, Any]:
     """Writes `run.json`, unless the same is there, and returns its content."""
     file = directory.folder / "run.json"
     num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
-    is_measured = state.best_generation >= 0
+    is_measured = state.best.generation >= 0
     means = [float(x["train_steps_mean"]) for x in directory.rows]
     counts = {
         "ended": "solved" if state.solved else "finished" if is_measured else "diverged",
-        "best_score": float(state.best_score) if is_measured else None,
+        "best_score": float(state.best.score) if is_measured else None,
         "solved_score": bilevel.solved_score,
         "generations": len(directory.rows),
         "agents": len(directory.rows) * num_trainings,
