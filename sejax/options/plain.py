@@ -189,13 +189,10 @@ class _Field(typing.NamedTuple):
 
 
 def _read(value: Any, hint: Any, field: _Field) -> Any:
-    """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf."""
+    """A value as its field's type: values by key; a plugin; a dataclass; or a leaf."""
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
-        one = field.group if len(value) == 1 else None  # an only agent's fields are `agent.FIELD`
-        names = {key: one or f"{field.name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
-        fields = {key: field._replace(name=x, default=MISSING) for key, x in names.items()}
-        return {str(key): _read(value[key], of_key, x) for key, x in fields.items()}
+        return _read_by_key(value, of_key, field)
     if field.group:
         if isinstance(value, Mapping) and field.default is not MISSING:
             value = {"name": registry.name_of(field.group, field.default), **value}
@@ -206,6 +203,16 @@ def _read(value: Any, hint: Any, field: _Field) -> Any:
         base = to_plain(field.default) if isinstance(field.default, hint) else {}
         return from_plain(hint, base | value, field.name)
     return _leaf(value, hint, field)
+
+
+def _read_by_key(values: Mapping[Any, Any], hint: Any, field: _Field) -> dict[str, Any]:
+    """Values of one type by their keys, sorted."""
+    read = {}
+    for key in sorted(values, key=str):
+        is_only = len(values) == 1  # an only agent's fields are `agent.FIELD`
+        name = (field.group if is_only else None) or f"{field.name}.{shortened(key, 40)}"
+        read[str(key)] = _read(values[key], hint, field._replace(name=name, default=MISSING))
+    return read
 
 
 def _leaf(value: Any, hint: Any, field: _Field) -> Any:

@@ -95,8 +95,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
             name = typed.get(group, {}).get("name")
             if name is not None and file.get(group, {}).get("name", name) != name:
                 del file[group]
-        is_whole = bool(CHOOSE_ALL & texts.keys())
-        return [drop_replaced(file, typed, is_whole), typed]
+        return [drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed]
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -142,10 +141,8 @@ def chosen_agents(values: Mapping[str, Any]) -> Tree:
         text = str(values[word])
         is_list = text.startswith("[") and text.endswith("]")
         names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
-        several = ",".join(dict.fromkeys(filter(None, [*known, *names]))) or "ddqn,ppo"
         is_clear = all(names) and not known and len({*names}) == len(names)
-        fix = f"Set agents=[{shortened(several)}]."
-        require(is_clear, word, "must name each agent once", got=values[word], fix=fix)
+        require(is_clear, word, "must name each agent once", got=text, fix="Set agents=[ddqn,ppo].")
         known = names
     return {registry.key_of(name): {"name": name} for name in known}
 
