@@ -57,7 +57,7 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
     """Name, type, default and meaning of each field; of an experiment, of those of its own."""
     comments: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        if dataclasses.is_dataclass(base):
+        if dataclasses.is_dataclass(base) and dataclasses.fields(base):
             comments |= {name: text for name, text in comments_of_fields(base).items() if text}
     comments |= help_texts(cls)
     shared = (
