@@ -9,6 +9,7 @@ import dataclasses
 import inspect
 import io
 import re
+import textwrap
 import tokenize
 from collections.abc import Iterator
 from typing import Annotated, Any, get_args, get_origin
@@ -35,7 +36,7 @@ def type_text(hint: Any) -> str:
 
 def comments_of_fields(cls: type) -> dict[str, str]:
     """The comment above or behind each field that the class itself has."""
-    source = inspect.cleandoc(inspect.getsource(cls))
+    source = textwrap.dedent(inspect.getsource(cls))
     above: dict[int, str] = {}  # by line: comments that have it for themselves
     behind: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -57,7 +58,7 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
     """Name, type, default and meaning of each field; of an experiment, of those of its own."""
     comments: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        if dataclasses.is_dataclass(base) and dataclasses.fields(base):
+        if dataclasses.is_dataclass(base):
             comments |= {name: text for name, text in comments_of_fields(base).items() if text}
     comments |= help_texts(cls)
     shared = (
