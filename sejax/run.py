@@ -84,9 +84,8 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     if diverged:
         runs = ", ".join(map(str, diverged))
         what = f"All agents of {runs} diverged, or all on its search means: nothing was learned."
-        fix = "Does the task return NaN? If it does not, set a smaller agent.learning_rate."
-        anew = "Delete the folder, or set another run_dir, to begin anew."
-        raise FailedError(f"{what} {fix} {anew}")
+        fix = "Does the task return NaN? If not, set another agent.learning_rate and run_dir."
+        raise FailedError(f"{what} {fix}")
     return [scores[config.folder] for config in configs]
 
 

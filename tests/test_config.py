@@ -234,8 +234,8 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
      ""), ("training.max_steps=null training.max_episodes=1", "training.max_episodes", "=4"),
     ("agent=ppo proxy.horizon=null training.max_steps=100", "training.max_steps", "max_steps=512"),
     ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
-    ("num_seeds=4", "num_seeds", "mean seed?"), ("es.mirrored=yes", "es.mirrored", "be true or "),
-    ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", "any more"),
+    ("num_seeds=4", "num_seeds", "seed=0,1,2"), ("es.mirrored=yes", "es.mirrored", "be true or "),
+    ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", ""),
 ])  # fmt: skip
 def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     override, field, suggested

@@ -91,7 +91,12 @@ def _strongly_typed(x: Any) -> Array:
 
 
 def _mesh(num_devices: int | None) -> Mesh:
-    devices = jax.devices()[: num_devices or None]
+    """The first devices; all of them for None."""
+    available = jax.devices()
+    num_devices = checked(num_devices, Count, "devices", None)
+    is_fit = num_devices is None or num_devices <= len(available)
+    require(is_fit, "devices", f"must be at most {len(available)}", got=num_devices, use="null")
+    devices = available[:num_devices]
     return jax.make_mesh((len(devices),), ("device",), (AxisType.Auto,), devices=devices)
 
 
@@ -115,11 +120,7 @@ def spread_groups_over_devices(
     Returns:
       A function of the arguments: a tuple for each group, with a leading axis over its elements.
     """
-    num_devices = checked(num_devices, Count, "devices", None)
     num_parallel = checked(num_parallel, Count, "num_parallel", None)
-    available = jax.device_count()
-    is_fit = num_devices is None or num_devices <= available
-    require(is_fit, "devices", f"must be at most {available}", got=num_devices, use="null")
     mesh = _mesh(num_devices)
     widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 

@@ -10,6 +10,8 @@ GONE: dict[str, object] = {"agent.torso": None, "agent.num_filters": 16, "agent.
 GONE |= {f"agent.{x}": 1 for x in ("train_every", "gradient_steps", "target_update_every")}
 GONE |= {"baseline": True, "agent.noisy_tests": False, "mixture.compared_by": "advantage"}
 GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True, "num_seeds": 1}
+# What says the same today.
+INSTEAD = {"num_seeds": "seed=0,1,2"}
 
 
 def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:

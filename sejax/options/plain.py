@@ -12,6 +12,7 @@ import re
 import typing
 from collections.abc import Collection, Mapping
 from contextlib import suppress
+from difflib import get_close_matches
 from typing import Any
 
 from sejax.options import (
@@ -33,7 +34,7 @@ T = typing.TypeVar("T")
 MISSING = dataclasses.MISSING
 NAMED = 2  # fields of a message about settings that differ
 # Our names of fields, by the names that others use.
-SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate", "num_seeds": "seed"}
+SYMBOLS = {"sigma": "noise_std", "alpha": "step_size", "lr": "learning_rate"}
 # Last parts of the names of fields whose text may be a `module:attribute`, or code's address.
 NAMES_CODE = ("name", "env", "policy", "proxy_kind", "score_transform", "algorithms", "address")
 _CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
@@ -170,14 +171,16 @@ def defaults_of(cls: type) -> dict[str, Any]:
 
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """The error for an unknown field, with the nearest known fields."""
+    if field in old.INSTEAD:
+        return ConfigError(field, "is no field any more", fix=f"Set {old.INSTEAD[field]}.")
     last = field.rpartition(".")[2]
     field = shortened(field, 40)
     usual = SYMBOLS.get(last, last)
-    ranked = [name for name in known if name.rpartition(".")[2] == usual] or nearest(field, known)
-    fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    is_gone = last in {name.rpartition(".")[2] for name in old.GONE}
-    rule = "is no field any more" if is_gone else "is no field"
-    return ConfigError(field, rule, fix=f"{fix}Fields: {listed(ranked)}.")
+    same = [name for name in known if name.rpartition(".")[2] == usual]
+    close = same or get_close_matches(field, known, 1)
+    fix = f"Did you mean {close[0]}? " if close else ""
+    fix += f"Fields: {listed(same or nearest(field, known))}."
+    return ConfigError(field, "is no field", fix=fix)
 
 
 class _Field(typing.NamedTuple):

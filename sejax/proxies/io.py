@@ -294,6 +294,7 @@ def save_set(
       ConfigError: as `save`.
       OSError: if it cannot be written; an older file stays as it was.
     """
+    require(isinstance(env, ProxyEnv), "env", "must be a proxy's. Write save(path, env, weights).")
     rule = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(discount is not None or not env.config.needs_discount, "discount", rule)
     gamma = 1.0 if discount is None else discount

@@ -140,8 +140,7 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
 def _devices(overrides: Sequence[str]) -> int | None:
     """The largest number that words `devices=` ask for, before these are checked; None without."""
     texts = [word.removeprefix("devices=") for word in overrides if word.startswith("devices=")]
-    counts = re.findall(r"\b[1-9]\d{0,3}\b", ",".join(texts))
-    return max(map(int, counts), default=None)
+    return max(map(int, re.findall(r"\b[1-9]\d{0,3}\b", ",".join(texts))), default=None)
 
 
 @contextlib.contextmanager

@@ -27,8 +27,7 @@ class RunProgress:
         self._steps = 0
         env, proxy = config.name("env"), config.name("proxy")
         if f"{env}-{proxy}" not in presets.PRESETS:
-            none = f"There are no tuned settings for env={env} with proxy={proxy}"
-            self.say(f"{none}: these are general ones, not tuned (docs/defaults.md).")
+            self.say(f"env={env} has no tuned settings for proxy={proxy} (docs/defaults.md).")
 
     def status(self, text: str) -> None:
         """Prints a step of the work before a generation; steps per second count from it on."""

@@ -116,7 +116,7 @@ class RunDirectory(Store):
         try:
             state = as_tree(self._tensors, like)
         except ValueError as error:
-            raise self.damaged(_CHECKPOINT, error) from error
+            raise self.refused(f"must be of this version; got {self.folder}, {error}") from error
         self._remake()
         return state
 
@@ -224,7 +224,7 @@ def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
     leaves = _named(like)
     differing = differences(_shapes(tensors), _shapes(jax.eval_shape(_bare, leaves)))
     if differing:
-        raise ValueError(f"this version has a state of other shapes: {differing}")
+        raise ValueError(f"whose state differs in {differing}")
     restored = []
     for name, leaf in leaves.items():
         array = jax.numpy.array(tensors[name])

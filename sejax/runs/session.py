@@ -57,10 +57,8 @@ def run(
     drawn = time.monotonic()
     num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
     folder = directory.folder.resolve()
-    resumed_at = len(directory.rows)
-    about = TrackedRun(
-        folder=folder, id=directory.id, generation=resumed_at, config=directory.settings
-    )
+    start = len(directory.rows)
+    about = TrackedRun(folder=folder, id=directory.id, generation=start, config=directory.settings)
     with contextlib.closing(GuardedTracker(config.tracker, about, report.say)) as tracker:
         while not state.solved and (first := len(directory.rows)) < config.generations:
             if first and all(float(x["num_nonfinite"]) == num_trainings for x in directory.rows):

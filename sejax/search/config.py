@@ -17,7 +17,7 @@ from sejax.search import spaces
 
 REDUCTION_FACTOR = 3  # eta of Hyperband
 # Fields of a run that the search sets for each trial.
-SET_BY_SEARCH = ("generations", "run_dir", "checkpoint_every", "machines")
+SET_BY_SEARCH = ("generations", "num_seeds", "run_dir", "checkpoint_every", "machines")
 # Fields that a search cannot vary: scores would not compare, or not depend on them.
 ONE_VALUE = ("env", "proxy", "objective", "seed", "tracker", "devices", "num_parallel")
 
