@@ -3,8 +3,8 @@
   python -m sejax.check proxy=RUN_DIR
   python -m sejax.check proxy=cartpole num_agents=40 'algorithms=[sac]'
 
-- Myopia: the agents that it was learned with, at lower discounts. Left out if episodes have one
-  step, where a discount has no effect.
+- Myopia: the agents that it was learned with, at discounts 0, 0.5 and 0.9. Left out if episodes
+  have one step, where a discount has no effect.
 - Algorithms: other agents than those that it was learned with.
 - Null baseline: for an SE, the same agents on a one-step SE made of a cheap policy; for a reward
   network (RN), the same agents without it, and tuned agents.

@@ -248,7 +248,7 @@ def make_evaluator(
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
     require_agent(agent, task.observation, task.action)
     require_part("training", TrainingConfig, training)
-    # A test may last to the task's limit, which must not dwarf the training, or 1,000 steps.
+    # A test of an agent that has not learned may last to the task's limit.
     most = 1000 * max(training.max_steps or LARGEST, 1000)
     rule = f"must be at most {most:,}"
     require(task.max_steps <= most, "env.max_steps", rule, got=f"{task.max_steps:,}", use=1000)

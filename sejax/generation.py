@@ -46,7 +46,7 @@ class Layout:
     mixture: Mixture
 
     @property
-    def num_incumbent_evals(self) -> int:
+    def num_on_incumbent(self) -> int:
         """Trainings on the incumbent, rounded up to equally many with each agent."""
         return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
 
@@ -60,28 +60,28 @@ class Layout:
         return self.mixture.deal(self.strategy.num_candidates, self.strategy.antithetic)
 
     @property
-    def num_evaluations(self) -> int:
+    def num_on_candidates(self) -> int:
         """Trainings on candidates; those on the incumbent come after them."""
         return self.strategy.num_candidates * self.strategy.num_evals
 
     @functools.cached_property
-    def evaluations_of(self) -> tuple[np.ndarray, ...]:
+    def candidate_trainings_of(self) -> tuple[np.ndarray, ...]:
         """For each agent, the numbers of its trainings on candidates, ascending."""
-        by_candidate = np.arange(self.num_evaluations).reshape(-1, self.strategy.num_evals)
+        by_candidate = np.arange(self.num_on_candidates).reshape(-1, self.strategy.num_evals)
         return tuple(by_candidate[candidates].ravel() for candidates in self.candidates_of)
 
     @functools.cached_property
     def trainings_of(self) -> tuple[np.ndarray, ...]:
         """For each agent, the numbers of all its trainings, ascending; see the table above."""
-        on_incumbent = self.num_evaluations + np.arange(self.num_incumbent_evals)
+        on_incumbent = self.num_on_candidates + np.arange(self.num_on_incumbent)
         turns = on_incumbent.reshape(-1, self.mixture.size).T  # [agent, turn]
-        pairs = zip(self.evaluations_of, turns, strict=True)
+        pairs = zip(self.candidate_trainings_of, turns, strict=True)
         return tuple(np.concatenate(pair) for pair in pairs)
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""
-        of_population = np.arange(self.num_evaluations)
-        of_incumbent = np.arange(self.num_incumbent_evals)
+        of_population = np.arange(self.num_on_candidates)
+        of_incumbent = np.arange(self.num_on_incumbent)
         if self.strategy.common_random_numbers:
             of_population = of_population % self.strategy.num_evals
             of_incumbent = of_incumbent // self.mixture.size

@@ -122,11 +122,11 @@ class Scoring:
         )
 
     def _scores(self, of_trainings: Float[Array, " training"]) -> Scores:
-        population, incumbent = jnp.split(of_trainings, [self.layout.num_evaluations])
+        population, incumbent = jnp.split(of_trainings, [self.layout.num_on_candidates])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
         repaired = []
         means = []
-        for scores, numbers in zip(turns, self.layout.evaluations_of, strict=True):
+        for scores, numbers in zip(turns, self.layout.candidate_trainings_of, strict=True):
             repaired_scores, mean = with_diverged_last(scores, population[numbers])
             repaired.append(repaired_scores)
             means.append(mean)

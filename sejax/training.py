@@ -196,8 +196,8 @@ def make_trainer(
 
     Raises:
       ConfigError: for arguments of the wrong kind; if `training` has a fixed number of steps and
-        too few episodes for them, or stops at a solved reward that is not finite; or if tests are
-        asked for and no `test_fn` is given.
+        too few episodes of a proxy for them, or stops at a solved reward that is not finite; or if
+        tests are asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
 

@@ -54,7 +54,7 @@ def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, num_candida
 @pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
 def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
     bilevel = make_bilevel(task=TASK, agent=mixture(num), es=NESConfig(num_incumbent_evals=asked))
-    assert bilevel.layout.num_incumbent_evals == evals
+    assert bilevel.layout.num_on_incumbent == evals
 
 
 @pytest.mark.parametrize(("make", "field"), [
