@@ -133,8 +133,8 @@ class CommandConfig(Options, ABC):
             elif len(runs) > 1:
                 folder = folder or config.default_folder
             config = dataclasses.replace(config, **{cls.folder_field: folder})
-            is_same = str(by_folder.setdefault(config.folder, config)) == str(config)
-            require(is_same, cls.folder_field, "must differ for each run", got=config.folder)
+            first = by_folder.setdefault(config.folder, config)
+            require(str(first) == str(config), cls.folder_field, "must differ by run", got=folder)
         return [*by_folder.values()]
 
     @classmethod
