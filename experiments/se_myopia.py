@@ -85,7 +85,7 @@ def find(settings: SeMyopia) -> Iterator[Se]:
 
 def set_name(file: str) -> str:
     """A file's name for people: of those that are one set, the folder that they are in."""
-    if file in header.pretrained_names():
+    if file in header.pretrained_files():
         return f"{file} (shipped)"
     ends = r"^results/|/ses\.safetensors$|/[^/]+/proxy\.safetensors$|\.safetensors$"
     return re.sub(ends, "", file)

@@ -31,7 +31,7 @@ from pydantic import Field
 from sejax import agents
 from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
-from sejax.distill.teaching import counted
+from sejax.distill.teaching import diverged_last
 from sejax.envs.base import Task
 from sejax.myopia import ENOUGH, Judgement, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
@@ -306,7 +306,7 @@ def _reported(
 def _scored(table: pd.DataFrame, proxy: Proxy) -> pd.DataFrame:
     """The table with scores: returns for an SE, minus the training steps for an RN."""
     is_lost = table["nonfinite"] > 0
-    returns = counted(table["test_return"].mask(is_lost))
+    returns = diverged_last(table["test_return"].mask(is_lost))
     steps = table["train_steps"].mask(is_lost, table["train_steps"].max())
     score = -steps if proxy.env.is_real else returns
     solved = reaches(returns, proxy.task.solved_reward)

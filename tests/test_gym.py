@@ -21,7 +21,7 @@ from sejax.gym import RealTask, SyntheticGymEnv, SyntheticVectorEnv, SyntheticWo
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import find, pretrained_names
+from sejax.proxies.header import find, pretrained_files
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -204,7 +204,7 @@ def test_lanes_are_single_environments(name, mode):
 
 
 def test_gymnasium_makes_the_shipped_ones_by_their_names():
-    ids = [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
+    ids = [f"sejax.gym:sejax/{name}" for name in pretrained_files()]
     assert sejax.gym.register() == sejax.gym.register() == ids
     env = gymnasium.make("sejax/cartpole")
     assert env.spec.id == "sejax/cartpole" and "TimeLimit" not in str(env)
@@ -268,7 +268,7 @@ CHECKED = [
 ]
 
 
-@pytest.mark.parametrize("source", [*CHECKED, *pretrained_names()], ids=str)
+@pytest.mark.parametrize("source", [*CHECKED, *pretrained_files()], ids=str)
 @pytest.mark.filterwarnings(
     "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
     "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque

@@ -60,7 +60,7 @@ def test_lanes_have_their_own_attributes_and_step_together():
     envs.close()
 
 
-@pytest.mark.parametrize("name", header.pretrained_names())
+@pytest.mark.parametrize("name", header.pretrained_files())
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric:UserWarning")
 def test_its_checker_passes_for_what_ships(name):
     check_env(sejax.gym.make(name))

@@ -14,6 +14,7 @@ from sejax.distill.policies import CopyConfig, acting, copy_policy, erring, visi
 from sejax.distill.policy_search import (
     Policy,
     PolicySearchConfig,
+    first_policy,
     linear_act,
     make_search,
     step_size,
@@ -31,7 +32,7 @@ RNG = np.random.default_rng(1)
 def test_a_generation_moves_along_the_best_directions_on_any_devices():
     weights = jnp.asarray(RNG.normal(size=(2, 5)), jnp.float32) * 0.1
     searches = [make_search(SMALL, CARTPOLE, devices) for devices in (1, 2)]
-    before = searches[0].init()._replace(weights=weights)
+    before = first_policy(CARTPOLE)._replace(weights=weights)
     on_one, on_two = (jax.jit(search.generation) for search in searches)
     after, returns, num_steps = on_one(jax.random.key(5), before, 2)
     assert_equal((after, returns, num_steps), on_two(jax.random.key(5), before, 2))
@@ -49,7 +50,7 @@ def test_a_generation_moves_along_the_best_directions_on_any_devices():
 
 
 def test_moments_are_those_of_all_that_was_seen():
-    policy = make_search(SMALL, PENDULUM).init()
+    policy = first_policy(PENDULUM)
     rows = RNG.normal(size=(3, 40, 3)).astype(np.float32) * [1, 5, 0.2] + [3, 0, -1]
     valid = RNG.uniform(size=(3, 40)) < [[0.7], [0.5], [0.0]]
     for obs, mask in zip(rows, valid, strict=True):
@@ -84,13 +85,13 @@ def test_the_step_size_declines_in_the_second_half():
 @pytest.mark.slow
 def test_a_search_solves_cartpole_and_takes_bonuses_out():
     search = make_search(dataclasses.replace(SMALL, num_directions=16), CARTPOLE)
-    generation, policy = jax.jit(search.generation), search.init()
+    generation, policy = jax.jit(search.generation), first_policy(CARTPOLE)
     for i in range(6):
         policy, *_ = generation(jax.random.fold_in(jax.random.key(0), i), policy, i)
     assert float(jax.jit(search.test)(jax.random.key(1), policy).returns.mean()) > 150
     # Without the reward for standing nothing is learned: every direction is as good.
     flat = make_search(dataclasses.replace(SMALL, alive_bonus=1.0), CARTPOLE)
-    policy, *_ = jax.jit(flat.generation)(jax.random.key(0), flat.init(), 0)
+    policy, *_ = jax.jit(flat.generation)(jax.random.key(0), first_policy(CARTPOLE), 0)
     assert not np.asarray(policy.weights).any()
 
 

@@ -118,7 +118,7 @@ def test_a_set_of_one_plays_in_numpy_too(tmp_path):
 def test_registering_with_gymnax_is_idempotent():
     gymnax = pytest.importorskip("gymnax")
     ids = sejax.register_gymnax()
-    assert sejax.register_gymnax() == ids == [f"sejax/{x}" for x in header.pretrained_names()]
+    assert sejax.register_gymnax() == ids == [f"sejax/{x}" for x in header.pretrained_files()]
     for env_id in (ids[0], ids[-1]):
         _, params = gymnax.make(env_id)
         chex.assert_trees_all_equal(params, sejax.load(env_id.removeprefix("sejax/"))[1])

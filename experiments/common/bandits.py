@@ -20,7 +20,13 @@ from jaxtyping import Array, Float
 
 import sejax
 from sejax.check import ARS
-from sejax.distill.policy_search import Policy, PolicySearchConfig, linear_act, make_search
+from sejax.distill.policy_search import (
+    Policy,
+    PolicySearchConfig,
+    first_policy,
+    linear_act,
+    make_search,
+)
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_fixed, make_recorder, make_tester
@@ -204,7 +210,7 @@ def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
         policy, _, num_steps = search.generation(key_search, policy, 0)  # its step size stays
         return policy, num_steps, search.test(key_test, policy)
 
-    init = search.init()
+    init = first_policy(task)
     return agent, init, jax.jit(generation).lower(jax.random.key(0), init).compile()
 
 
@@ -231,7 +237,8 @@ def copy(task: Task, teacher: Teacher, num_states: int, widen: float) -> Copied:
     is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
     if np.isinf(widen):
         config: Any = sejax.config([f"env={task.name}"]).proxy
-        units = config.units(task.observation)
+        space: Any = task.observation
+        units = config.units(space.low, space.high)
         states = noise if units is None else units.decode(noise)
     else:
         states = jnp.where(

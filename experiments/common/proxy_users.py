@@ -16,7 +16,7 @@ from experiments.common.experiment import Settings, setting
 from experiments.common.shards import stack
 from sejax import Proxy, Task, TrainingConfig, options
 from sejax.options import Count, registry
-from sejax.proxies.header import pretrained_names
+from sejax.proxies.header import pretrained_files
 
 NUM_GROUPS = 5  # of agents: the CPU seconds of a group are one value
 COUNTS = (100, 20)  # agents of each sort, pilots of each kind
@@ -53,7 +53,7 @@ class BreakEven(Settings):
     name = "break_even"
 
     proxies: tuple[str, ...] = setting(
-        tuple(pretrained_names()), pretrained_names(), quick=("cliff_walking-rn",)
+        tuple(pretrained_files()), pretrained_files(), quick=("cliff_walking-rn",)
     )
     num_agents: Annotated[int, Field(ge=NUM_GROUPS)] | None = setting(None, quick=10)
     num_pilots: Count | None = setting(None, quick=2)

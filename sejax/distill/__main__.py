@@ -24,12 +24,12 @@ import pandas as pd
 from sejax import agents, envs
 from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
-from sejax.distill.teaching import counted, grades, students
+from sejax.distill.teaching import diverged_last, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, registry, require
+from sejax.options import Count, registry
 from sejax.options.plain import defaults_of, flatten, merge, plugin
 from sejax.proxies import header, zoo
-from sejax.proxies.exact import make_exact
+from sejax.proxies.exact import make_exact, require_vectors
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import commands, runtime
@@ -83,8 +83,7 @@ class DistillConfig(CommandConfig):
         super().__post_init__()
         spec = envs.spec_of(self.env)
         task_name = registry.name_of("env", self.env)
-        is_fit = spec.states == "vector"
-        require(is_fit, "env", "must observe vectors", got=task_name, use="cartpole")
+        require_vectors(spec, task_name)
         for key, agent in self.agents.items():
             agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
             self.require_learning(key, "training", self.training, ONE_STEP, spec)
@@ -210,7 +209,7 @@ def _distilled(config: DistillConfig, store: Store, words: str) -> Path:
 
 def evaluations_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
     """The results of fresh students of each agent, in the form that the SE's file keeps."""
-    rows = rows.assign(test_return=counted(rows["test_return"]))
+    rows = rows.assign(test_return=diverged_last(rows["test_return"]))
     of_agents = rows.groupby("agent", sort=False).agg(
         num_agents=("train_steps", "size"),
         return_mean=("test_return", "mean"),

@@ -115,7 +115,6 @@ class Search(NamedTuple):
     """The pure functions of a search.
 
     Attributes:
-      init: `() -> Policy`, one that does nothing.
       generation: `(key, policy, number) -> (policy, returns, num_steps)`: the next policy, the
         returns of the episodes of all directions, `[2 * num_directions]`, bonuses included, and the
         number of steps on the real task.
@@ -123,10 +122,15 @@ class Search(NamedTuple):
       record: `(key, policy) -> Steps`, every step of the same episodes.
     """
 
-    init: Callable[[], Policy]
     generation: Callable[[Array, Policy, Array | int], tuple[Policy, Array, Array]]
     test: Callable[[Array, Policy], Tests]
     record: Callable[[Array, Policy], Steps]
+
+
+def first_policy(task: Task) -> Policy:
+    """The policy that a search begins with, which does nothing."""
+    zeros = jnp.zeros(task.obs_dim)
+    return Policy(jnp.zeros((task.action_dim, task.obs_dim + 1)), jnp.float32(0), zeros, zeros)
 
 
 def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
@@ -153,19 +157,15 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
       >>> task = sejax.envs.make("mountain_car")
       >>> search = make_search(PolicySearchConfig(num_directions=4, num_top=2), task, devices=1)
       >>> policy, returns, _ = jax.eval_shape(
-      ...     search.generation, jax.random.key(0), search.init(), 0)
+      ...     search.generation, jax.random.key(0), first_policy(task), 0)
       >>> policy.weights.shape, returns.shape
       ((3, 3), (8,))
     """
-    require_vectors(task)
+    require_vectors(task, task.name)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
     shape = (task.action_dim, task.obs_dim + 1)
     num_episodes = 2 * config.num_directions
     play, record_one = make_tester(agent, task, 1), make_recorder(agent, task, 1)
-
-    def init() -> Policy:
-        zeros = jnp.zeros(task.obs_dim)
-        return Policy(jnp.zeros(shape), jnp.float32(0), zeros, zeros)
 
     def episode(key: Array, policy: Policy, size: Array) -> tuple[Array, Array]:
         """The return of an episode with an error of this size, and its steps."""
@@ -200,7 +200,7 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
 
     test = make_tester(agent, task, config.num_tests)
     record = make_recorder(agent, task, config.num_tests)
-    return Search(init=init, generation=generation, test=test, record=record)
+    return Search(generation=generation, test=test, record=record)
 
 
 def random_map(key: Array, shape: tuple[int, ...]) -> Float[Array, "... inputs"]:
@@ -301,18 +301,14 @@ def search_policies(
 
     firsts = range(0, config.generations, config.test_every)
     num_tried = -(-min(config.start_generations, config.generations) // config.test_every)
-    ends = [advance(i, firsts[:num_tried], search.init()) for i in range(config.num_starts)]
+    ends = [advance(i, firsts[:num_tried], first_policy(task)) for i in range(config.num_starts)]
     best = int(max(rows, key=_test_mean)["start"])
     advance(best, firsts[num_tried:], ends[best])
-    chosen = _best_of_parts([row for row in rows if row["start"] == best], num_lessons)
+    tested = [row for row in rows if row["start"] == best]
+    parts = np.array_split(np.array(tested), min(num_lessons, len(tested)))
+    chosen = [max(part, key=_test_mean) for part in parts]
     lessons = [_lesson(config.num_tests, search, task, keys["record"], row) for row in chosen]
     return lessons, pd.DataFrame([{name: row[name].item() for name in COLUMNS} for row in rows])
-
-
-def _best_of_parts(rows: Sequence[Arrays], num_parts: int) -> list[Arrays]:
-    """The best tested policy of each of several equal parts of a search."""
-    parts = np.array_split(np.array(rows), min(num_parts, len(rows)))
-    return [max(part, key=_test_mean) for part in parts]
 
 
 def _lesson(num_tests: int, search: Search, task: Task, key: Array, row: Arrays) -> Lesson:

@@ -87,7 +87,7 @@ def teach(ses: Sequence[SE], agent: Agent, config: CommandConfig, keys: Array) -
     return dict(zip(COLUMNS, map(np.asarray, values), strict=True))
 
 
-def counted(returns: pd.Series) -> pd.Series:
+def diverged_last(returns: pd.Series) -> pd.Series:
     """Returns in which a student that diverged counts as the worst student.
 
     Raises:
@@ -103,6 +103,6 @@ def grades(rows: pd.DataFrame) -> pd.Series:
 
     A student that diverged counts as the worst student.
     """
-    returns = counted(rows["test_return"])
+    returns = diverged_last(rows["test_return"])
     by_agent = returns.groupby([rows["generation"], rows["agent"]]).agg(["mean", "min"])
     return by_agent.mean(axis=1).groupby("generation").mean()

@@ -12,16 +12,14 @@ from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWo
 from sejax.gym.tasks import Env, RealTask, real_env, se_task
 from sejax.options import Count, checked, require, require_known, require_package
 from sejax.options.plain import configure
-from sejax.proxies.header import PRETRAINED_DIR, Header, pretrained_names, read
+from sejax.proxies.header import Header, pretrained_files, read
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-Source = str | Path
-
 
 def make(
-    source: Source, task: RealTask | str | None = None, *, render_mode: str | None = None
+    source: str | Path, task: RealTask | str | None = None, *, render_mode: str | None = None
 ) -> Env:
     """Makes a stored proxy a Gymnasium environment: an SE, or the real task with an RN's reward.
 
@@ -51,7 +49,7 @@ def make(
 
 
 def make_vec(
-    source: Source,
+    source: str | Path,
     num_envs: int = 1,
     task: RealTask | str | None = None,
     *,
@@ -86,7 +84,7 @@ def make_vec(
     return SyntheticVectorEnv(world, num_envs, autoreset_mode)
 
 
-def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = None) -> "VecEnv":
+def make_sb3(source: str | Path, num_envs: int = 1, task: RealTask | str | None = None) -> "VecEnv":
     """Makes a stored proxy a `VecEnv` of Stable-Baselines3.
 
     The environments of an SE are stepped by one pass through its networks. Those of an RN are
@@ -123,19 +121,19 @@ def register() -> list[str]:
       >>> register()[0], gymnasium.make("sejax.gym:sejax/acrobot").action_space
       ('sejax.gym:sejax/acrobot', Discrete(3))
     """
-    for name in pretrained_names():
+    for name, path in pretrained_files().items():
         # With `max_episode_steps` Gymnasium would add a second time limit.
         spec = gymnasium.envs.registration.EnvSpec(
             f"sejax/{name}",
             "sejax.gym:make",
             vector_entry_point="sejax.gym:make_vec",
-            kwargs={"source": str(PRETRAINED_DIR / f"{name}.safetensors")},
+            kwargs={"source": str(path)},
         )
         gymnasium.registry.setdefault(spec.id, spec)
-    return [f"sejax.gym:sejax/{name}" for name in pretrained_names()]
+    return [f"sejax.gym:sejax/{name}" for name in pretrained_files()]
 
 
-def _read(source: Source, task: RealTask | str | None) -> tuple[Header, SyntheticWorld | None]:
+def _read(source: str | Path, task: RealTask | str | None) -> tuple[Header, SyntheticWorld | None]:
     """The header of a file, and its SE, or None for an RN.
 
     Raises:

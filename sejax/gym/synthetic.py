@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from sejax.envs.spec import Box
 from sejax.gym import networks
 from sejax.gym.tasks import Info, RealTask
 from sejax.options import require, require_known
@@ -57,12 +56,12 @@ class SyntheticWorld:
         action_dim = spaces.flatdim(task.action_space)
         self._units = None
         if isinstance(space, spaces.Box):
-            self._units = config.units(Box(tuple(space.low), tuple(space.high)))
+            self._units = config.units(space.low, space.high)
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
-        units = config.networks(self.obs_dim, action_dim)
-        check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
+        sizes = config.networks(self.obs_dim, action_dim)
+        check_tensors("weights", weights, networks.shapes_of(sizes), "those of the proxy's task")
         self._start_layers = networks.network_layers(weights, "start")
-        heads = [networks.network_layers(weights, name) for name in units if name != "start"]
+        heads = [networks.network_layers(weights, name) for name in sizes if name != "start"]
         self._layers = networks.joined(heads)
         are_known = self.draws_noise or task.starts
         require(are_known, "task.starts", "must draw initial states. Set RealTask(starts=...).")

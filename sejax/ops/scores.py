@@ -14,7 +14,7 @@ step                               its score
                                    finite one where they are added
 `Bilevel.tell`                     an incumbent with nan is never the best
 `fresh_agents.summarise`,          in tables: the worst return of all agents
-`distill.teaching.counted`
+`distill.teaching.diverged_last`
 ================================== ================================================================
 """
 

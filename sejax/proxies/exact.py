@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from sejax.envs.base import Task
+from sejax.envs import Task, TaskSpec
 from sejax.options import require
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import START_HIDDEN_SIZE, SyntheticConfig, Vector
@@ -64,7 +64,7 @@ def make_exact(
     """
     states = np.asarray(states, float)
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
-    require_vectors(task)
+    require_vectors(task, task.name)
     is_fit = states.shape == (len(states), task.obs_dim) and np.isfinite(states).all()
     rule = f"must be two or more rows of {task.obs_dim} finite numbers"
     require(is_fit and len(states) > 1, "states", rule, got=states.shape)
@@ -89,13 +89,13 @@ def make_exact(
     return config.make(task), weights
 
 
-def require_vectors(task: Task) -> None:
+def require_vectors(spec: TaskSpec, task_name: str) -> None:
     """Checks that a task's observations are vectors.
 
     Raises:
       ConfigError: if they are not.
     """
-    require(task.num_states is None, "env", "must observe vectors", got=task.name, use="cartpole")
+    require(spec.states == "vector", "env", "must observe vectors", got=task_name, use="cartpole")
 
 
 def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:

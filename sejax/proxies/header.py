@@ -142,9 +142,9 @@ def configured(group: str, values: object, where: str) -> Any:
 # --- where a file is ------------------------------------------------------------------------------
 
 
-def pretrained_names() -> list[str]:
-    """Names of the proxies that ship with the package. Agents can train on each of them."""
-    return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
+def pretrained_files() -> dict[str, Path]:
+    """The proxies that ship with the package, by name. Agents can train on each of them."""
+    return dict(sorted((path.stem, path) for path in PRETRAINED_DIR.glob("*.safetensors")))
 
 
 def find(source: str | Path, option: str = "source") -> Path:
@@ -164,12 +164,12 @@ def find(source: str | Path, option: str = "source") -> Path:
     file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path
     if os.path.isfile(file):
         return Path(file)
-    if name in pretrained_names():
-        return PRETRAINED_DIR / f"{name}.safetensors"
+    if name in pretrained_files():
+        return pretrained_files()[name]
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
         rule = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError(option, f"{rule}; got {shortened(name)}, where there is none.")
-    raise unknown_name(option, name, pretrained_names())
+    raise unknown_name(option, name, pretrained_files())
 
 
 # --- reading and writing --------------------------------------------------------------------------

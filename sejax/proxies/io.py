@@ -510,8 +510,7 @@ def register_gymnax() -> list[str]:
     """
     from gymnax import registration  # imports all of gymnax's environments, which takes a second
 
-    ids = {f"sejax/{name}": name for name in header.pretrained_names()}
-    for env_id in ids.keys() - set(registration.registered_envs):
-        path = header.PRETRAINED_DIR / f"{ids[env_id]}.safetensors"
-        registration.register(env_id, lambda path=path: load(path)[0])
-    return list(ids)
+    paths = {f"sejax/{name}": path for name, path in header.pretrained_files().items()}
+    for env_id in paths.keys() - set(registration.registered_envs):
+        registration.register(env_id, lambda path=paths[env_id]: load(path)[0])
+    return list(paths)

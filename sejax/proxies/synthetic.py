@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PyTree
+from numpy.typing import ArrayLike
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
@@ -130,19 +131,18 @@ class SyntheticConfig(ProxyConfig):
             networks["start"] = [obs_dim, self.start_hidden_size, obs_dim]
         return networks
 
-    def units(self, space: Box) -> Units | None:
-        """Units of states in a box; None for the task's own.
+    def units(self, low: ArrayLike, high: ArrayLike) -> Units | None:
+        """Units of states between two bounds; None for the task's own.
 
         An entry without bounds keeps its own unit; some spaces write "none" as a huge number.
 
         Example:
-          >>> space = Box(low=(-1.5, -np.inf), high=(0.5, np.inf))
-          >>> SyntheticConfig(state_units="bounds").units(space)
+          >>> SyntheticConfig(state_units="bounds").units([-1.5, -np.inf], [0.5, np.inf])
           Units(middle=array([-0.5,  0. ], dtype=float32), one=array([0.5, 1. ], dtype=float32))
         """
         if self.state_units == "raw":
             return None
-        low, high = (np.asarray(x, np.float32) for x in (space.low, space.high))
+        low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
         middle = (low + high) / 2
@@ -200,7 +200,7 @@ class SyntheticEnv(ProxyEnv):
         self._networks = config.networks(task.obs_dim, task.action_dim)
         self._units = None
         if isinstance(task.observation, Box):
-            self._units = config.units(task.observation)
+            self._units = config.units(task.observation.low, task.observation.high)
             # Without the task's bounds: a learned state need not respect them.
             self.spaces = Box.symmetric(*[MAX_ABS_VALUE] * task.obs_dim), task.action
 

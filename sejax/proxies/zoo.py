@@ -117,7 +117,7 @@ def pretrained() -> tuple[PretrainedProxy, ...]:
       >>> [proxy.name for proxy in pretrained() if proxy.kind == "se"][:2]
       ['acrobot', 'acrobot-distilled']
     """
-    files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
+    files = header.pretrained_files().values()
     return tuple(describe(header.read(file, single=True)) for file in files)
 
 

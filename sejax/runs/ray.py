@@ -186,11 +186,11 @@ class RemoteChunks(Chunks):
 # --- the cluster ----------------------------------------------------------------------------------
 
 
-def num_workers(machines: RayConfig) -> int:
-    """The number of workers: the user's, or one for each CPU core that the cluster has now.
+def require_cluster() -> None:
+    """Checks that the cluster still answers.
 
     Raises:
-      FailedError: if the cluster is gone: Ray itself would wait for ever.
+      FailedError: if it is gone: Ray itself would wait for ever.
     """
     import ray  # it comes with an extra
 
@@ -199,7 +199,6 @@ def num_workers(machines: RayConfig) -> int:
         what = "Ray has ended on this machine, so that no training can be sent out."
         fix = "The generations before are saved; start Ray and repeat the command to resume."
         raise FailedError(f"{what} {fix}")
-    return machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
 def _on_cluster(
@@ -207,7 +206,8 @@ def _on_cluster(
 ) -> Iterator[Any]:
     """A function's results for tuples of arguments, in their order, each as soon as it is there.
 
-    As many calls run at a time as there are workers.
+    As many calls run at a time as there are workers: the user's number, or one for each CPU core
+    that the cluster has now.
 
     Raises:
       FailedError: if a worker raises an error or dies again and again, or the cluster is lost.
@@ -216,7 +216,8 @@ def _on_cluster(
 
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
     versions = runtime.versions()
-    limit = num_workers(machines)
+    require_cluster()
+    limit = machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
     tasks: list[Any] = []  # sent ones, in the order of their items
     running: list[Any] = []
     try:
@@ -228,7 +229,7 @@ def _on_cluster(
                     running.append(tasks[-1])
                 done, running = ray.wait(running, timeout=LOOK_S)
                 if not done:
-                    num_workers(machines)  # raises if the cluster is gone
+                    require_cluster()
             yield ray.get(tasks[i])
     except ray.exceptions.RayError as error:  # its last line is the worker's error
         reason = shortened(str(error).strip().splitlines()[-1].strip(), 160)

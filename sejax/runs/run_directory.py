@@ -113,12 +113,12 @@ class RunDirectory(Store):
         """
         if self._tensors is None:
             return None
-        try:
-            state = as_tree(self._tensors, like)
-        except ValueError as error:
-            raise self.refused(f"must be of this version; got {self.folder}, {error}") from error
+        asked = jax.eval_shape(_bare, _named(like))
+        if differing := differences(_shapes(self._tensors), _shapes(asked)):
+            got = f"{self.folder}, whose state differs in {differing}"
+            raise self.refused(f"must be of this version; got {got}")
         self._remake()
-        return state
+        return _as_tree(self._tensors, like)
 
     def save(
         self, state: PyTree[jax.Array], info: GenerationInfo, wall_s: float, cpu_s: float
@@ -211,22 +211,15 @@ def _as_text(value: np.generic) -> str:
 # --- pytrees as tensors by name -------------------------------------------------------------------
 
 
-def as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
+def _as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
     """A pytree of stored leaves; each has its own memory and is tied to no device.
 
     Args:
       tensors: leaves by path.
       like: a pytree of the same structure; its shapes are enough.
-
-    Raises:
-      ValueError: if the structure, a shape or a dtype differs.
     """
-    leaves = _named(like)
-    differing = differences(_shapes(tensors), _shapes(jax.eval_shape(_bare, leaves)))
-    if differing:
-        raise ValueError(f"whose state differs in {differing}")
     restored = []
-    for name, leaf in leaves.items():
+    for name, leaf in _named(like).items():
         array = jax.numpy.array(tensors[name])
         restored.append(jax.random.wrap_key_data(array) if _is_key(leaf) else array)
     return cast(State, jax.tree.unflatten(jax.tree.structure(like), restored))
