@@ -137,6 +137,9 @@ class Bilevel:
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
+        The strategy compares other numbers (`Scoring.compared`) than are kept and shown
+        (`Scoring.reported`). After a run is over nothing changes: each new leaf is dropped.
+
         Of equally good incumbents it keeps the last. Reason: once incumbents reach the task's
         highest return, the search still moves to weights that also teach when perturbed.
         """

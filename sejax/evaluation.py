@@ -14,11 +14,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, require_agent, sizes_of
+from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, require_agent
 from sejax.agents.buffers import no_buffer
 from sejax.agents.varied import for_keys
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment
+from sejax.envs.spec import sizes_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.objectives import Outcome
 from sejax.ops.keys import step_keys
@@ -289,6 +290,9 @@ def make_tested_trainer(
 ) -> Callable[..., TrainResult]:
     """As `make_trainer`; tests between episodes, if `training` asks for any, are on the task.
 
+    If it asks for none, `make_trainer` leaves the tester out. On a task without a solved reward
+    `stop_rule=solved` ends no training, so that it counts as `never`.
+
     Args:
       agent: from `sejax.make_agent`.
       env: gymnax environment to train in.
@@ -300,8 +304,6 @@ def make_tested_trainer(
     """
     if training.stop_rule == "solved" and not task.is_solvable:  # tests would end no training
         training = dataclasses.replace(training, stop_rule="never")
-    if not training.tests_after_each:
-        return make_trainer(agent, env, training, task.solved_reward, **options)
     test = make_tester(agent, task, training.tests_after_each)
 
     def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:

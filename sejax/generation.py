@@ -134,7 +134,7 @@ class GenerationEvaluator:
       devices: as given.
       evaluators: for each agent, `(training) -> Outcome`, for one of its `Trainings`.
       widths: for each agent, the trainings in a vmapped batch on a CPU core; None for all.
-      num_trainings: for each agent, the number of trainings in a generation.
+      num_trainings: the number of trainings in a generation, with all agents.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
@@ -168,7 +168,7 @@ class GenerationEvaluator:
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
         self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
-        self.num_trainings = [numbers.size for numbers in layout.trainings_of]
+        self.num_trainings = layout.num_on_candidates + layout.num_on_incumbent
         self._layout = layout
         self._spread = spread_groups_over_devices(
             self.evaluators, self.widths, num_devices=devices, num_parallel=num_parallel

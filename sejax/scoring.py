@@ -46,19 +46,24 @@ class AgentInfo(struct.PyTreeNode):
 
 
 class GenerationInfo(struct.PyTreeNode):
-    """Statistics of a generation."""
+    """Statistics of a generation: a row of `metrics.csv`, and what it is made of.
 
-    generation: Array
-    incumbent_mean: Array
-    incumbent_std: Array
-    population_mean: Array
-    population_max: Array
-    best_so_far: Array
-    train_steps_mean: Array
+    Scores are those that people see (`Objective.reported`). Those of the population leave out
+    agents that diverged; among the incumbent's such agents rank last. Where `active` is False
+    nothing was trained: the other numbers are of trainings without a step, and mean nothing.
+    """
+
+    generation: Array  # int32
+    incumbent_mean: Array  # `Scores.incumbent_mean`, from before the update
+    incumbent_std: Array  # over all trainings on the incumbent
+    population_mean: Array  # over all trainings on candidates
+    population_max: Array  # of one training, not of a candidate's mean
+    best_so_far: Array  # the best `incumbent_mean`, this one included
+    train_steps_mean: Array  # over all trainings, as in the next two
     train_steps_max: Array
     train_episodes_mean: Array
-    num_nonfinite: Array
-    by_agent: AgentInfo
+    num_nonfinite: Array  # trainings that diverged
+    by_agent: AgentInfo  # the same for each agent of a mixture
     population_scores: Float[Array, " evaluation"]
     train_steps: Array  # `[training]` int32; sums may exceed 32 bits and are made on the host
     real_steps: Array  # in the same form: steps on the real task
@@ -97,7 +102,15 @@ class Scoring:
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
     ) -> GenerationInfo:
-        """The statistics of a generation."""
+        """The statistics of a generation.
+
+        Args:
+          scores: as `reported` of the outcome.
+          outcome: of all trainings.
+          generation: its number.
+          best: score of the best incumbent so far, with this one.
+          active: whether the run was not over before this generation.
+        """
         return GenerationInfo(
             generation=generation,
             incumbent_mean=scores.incumbent_mean,
@@ -122,16 +135,17 @@ class Scoring:
         )
 
     def _scores(self, of_trainings: Float[Array, " training"]) -> Scores:
+        """The scores of a generation's two groups, and their means, from one for each training.
+
+        The incumbent's come turn by turn, one of each agent in a turn. Each agent's turns are
+        repaired by the scores of the same agent alone, so they are taken apart by agent for it.
+        """
         population, incumbent = jnp.split(of_trainings, [self.layout.num_on_candidates])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
-        repaired = []
-        means = []
-        for scores, numbers in zip(turns, self.layout.candidate_trainings_of, strict=True):
-            repaired_scores, mean = with_diverged_last(scores, population[numbers])
-            repaired.append(repaired_scores)
-            means.append(mean)
-        incumbent = jnp.stack(repaired)  # [agent, turn]
-        agent_means = jnp.stack(means)
+        pairs = zip(turns, self.layout.candidate_trainings_of, strict=True)
+        by_agent = [with_diverged_last(scores, population[numbers]) for scores, numbers in pairs]
+        incumbent = jnp.stack([repaired for repaired, _ in by_agent])  # [agent, turn]
+        agent_means = jnp.stack([mean for _, mean in by_agent])
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
@@ -144,7 +158,10 @@ class Scoring:
     def _by_agent(
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
-        """A statistic of each agent's trainings; `values` may lack those on the incumbent."""
+        """A statistic of each agent's trainings; `values` may lack those on the incumbent.
+
+        These are numbered last. So their numbers lie beyond values that lack them, and drop out.
+        """
         by_agent = self.layout.trainings_of
         return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
 

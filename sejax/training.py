@@ -140,9 +140,19 @@ class _StepKeys(NamedTuple):
     reset: Array
     test: Array
 
+    @classmethod
+    def of(cls, key: Array, step: Array) -> "_StepKeys":
+        """Those of the `step`-th step of a loop with this key: as many as there are fields."""
+        return cls(*step_keys(key, step, len(cls._fields)))
+
 
 class _LoopState(struct.PyTreeNode):
-    """Carry of the step loop. Buffers and a row for each episode are carried beside it."""
+    """Carry of the step loop. Buffers and a row for each episode are carried beside it.
+
+    `step` counts decisions, and the keys and the buffer go by it. `train_steps` counts steps of the
+    world, more where actions are repeated, and the limits of steps go by it. `tested` stays what it
+    was until the next test; `step` writes it into the row of the episode that has just ended.
+    """
 
     active: Array
     step: Array  # decisions
@@ -156,6 +166,13 @@ class _LoopState(struct.PyTreeNode):
     nonfinite: Array
     test_steps: Array
     tested: Array  # mean return of the last tests
+
+
+class _Consts(NamedTuple):
+    """What the steps of a training only read: the key of all steps, and the prepared params."""
+
+    key: Array
+    env_params: PyTree
 
 
 # `(key, agent_state, active) -> (mean return, steps)`, on the real task.
@@ -298,7 +315,7 @@ class _Loop:
         body = partial(self.step if learns_each_step else self.rollout, buffer)
         per_check = STEPS_PER_CHECK if learns_each_step else 1
         (stored, curve), state = while_any_active(
-            body, (buffer.init(), curve), state, (key_steps, env_params), per_check
+            body, (buffer.init(), curve), state, _Consts(key_steps, env_params), per_check
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -313,6 +330,7 @@ class _Loop:
         )
 
     def begin(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> _LoopState:
+        """A fresh agent at the start of its first episode, before its first step."""
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
@@ -332,7 +350,11 @@ class _Loop:
         )
 
     def buffer(self, state: _LoopState) -> Buffer:
-        """The agent's buffer."""
+        """The agent's buffer, for transitions of the shapes that `state` implies.
+
+        A replay buffer gets no more rows than a training can have steps. Only the shapes of `state`
+        are read: nothing is computed.
+        """
 
         def example() -> Transition:
             action = self.agent.act(jax.random.key(0), state.agent_state, state.obs, explore=True)
@@ -344,9 +366,12 @@ class _Loop:
         return self.agent.buffer(jax.eval_shape(example), most)
 
     def rollout(
-        self, buffer: Buffer, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+        self, buffer: Buffer, large: PyTree, state: _LoopState, consts: _Consts, masked: bool
     ) -> tuple[PyTree, _LoopState]:
-        """Fills the buffer and learns from it. A training that ends before learns nothing."""
+        """Fills the buffer and learns from it. A training that ends before learns nothing.
+
+        An iteration of the loop, with the arguments of `step`: it replaces `learns_every` of them.
+        """
 
         def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
             large, state = carry
@@ -357,9 +382,8 @@ class _Loop:
         first_step = state.step
         large, state = jax.lax.fori_loop(0, buffer.learns_every, step, (large, state))
         stored, _ = large
-        key, _ = consts
         # Keys of the last step, which did not learn.
-        keys = _StepKeys(*step_keys(key, state.step - 1, 6))
+        keys = _StepKeys.of(consts.key, state.step - 1)
         is_full = state.step == first_step + buffer.learns_every
         agent_state = self.learn(state, buffer, stored, state.step, keys, is_due=is_full)
         return large, state.replace(agent_state=agent_state)
@@ -399,19 +423,31 @@ class _Loop:
         buffer: Buffer,
         large: PyTree,
         state: _LoopState,
-        consts: PyTree,
+        consts: _Consts,
         masked: bool,
         learns: bool = True,
     ) -> tuple[PyTree, _LoopState]:
-        """One agent step: act, step the world, store, learn, and close the episode if it ended."""
+        """One agent step: act, step the world, store, learn, and close the episode if it ended.
+
+        Args:
+          buffer: how steps are kept.
+          large: `(stored, curve)`: the buffer's arrays, and the learning curve's by name.
+          state: all else that changes.
+          consts: what all steps only read.
+          masked: a Python bool, from `while_any_active`: whether the training may be over already,
+            so that writes to `large` need a mask.
+          learns: a Python bool; False within a rollout, which learns at its end.
+
+        Returns:
+          `large` and `state` after the step.
+        """
         stored, curve = large
-        key, env_params = consts
-        keys = _StepKeys(*step_keys(key, state.step, 6))
+        keys = _StepKeys.of(consts.key, state.step)
         action = self.agent.act(keys.act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
-            keys.env, state.env_state, self.agent.env_action(action), env_params
+            keys.env, state.env_state, self.agent.env_action(action), consts.env_params
         )
-        truncated = self.env.is_truncated(env_state, env_params)
+        truncated = self.env.is_truncated(env_state, consts.env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)
         ended = terminated | truncated | nonfinite
         # What a target bootstraps with, before gamma.
@@ -439,16 +475,15 @@ class _Loop:
             nonfinite=nonfinite,
             active=state.active & (train_steps < (self.training.max_steps or LARGEST)),
         )
-        state = jax.lax.cond(
-            ended, lambda s: self.end_episode(keys, s, env_params, finished), lambda s: s, state
-        )
+        end_episode = partial(self.end_episode, keys, consts.env_params, finished)
+        state = jax.lax.cond(ended, end_episode, lambda state: state, state)
         entries = {"returns": episode_return, "episode_ends": train_steps}
         entries["test_returns"] = state.tested
         curve = {name: x.at[row].set(entries[name], mode="drop") for name, x in curve.items()}
         return (stored, curve), state
 
     def end_episode(
-        self, keys: _StepKeys, state: _LoopState, env_params: PyTree, finished: Array
+        self, keys: _StepKeys, env_params: PyTree, finished: Array, state: _LoopState
     ) -> _LoopState:
         """Tests and judges the episode, and starts the next one; `step` records it.
 
@@ -475,7 +510,12 @@ class _Loop:
         )
 
     def stops(self, state: _LoopState, recent: Array) -> Array:
-        """Whether training ends with the episode that has just ended."""
+        """Whether training ends with the episode that has just ended.
+
+        Args:
+          state: from before `end_episode` counts the episode, so that `state.episode` is its index.
+          recent: as in `is_plateau`, with this episode.
+        """
         training = self.training
         first = self.agent.spec.warmup_episodes
         num_episodes = state.episode + 1
@@ -519,5 +559,6 @@ def is_solved(
 
 
 def _all_finite(tree: PyTree) -> Array:
+    """Whether all floats of a pytree are finite; integers and keys always are."""
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool).all()

@@ -153,14 +153,14 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
     n = 20_000
-    noise = td3_of(DISCRETE).draw_noise(jax.random.key(0), (1, n))
+    noise = td3_of(DISCRETE).learning_noise(jax.random.key(0), (1, n))
     x = np.concatenate(noise)  # [3, n]
     # Standard Gumbel: mean 0.5772, variance pi^2 / 6.
     variance = np.array([1.0, np.pi**2 / 6, np.pi**2 / 6])
     assert (np.abs(x.mean(1) - [0.0, 0.57722, 0.57722]) < 5 * np.sqrt(variance / n)).all()
     np.testing.assert_allclose(x.var(1), variance, rtol=0.1)
     assert np.abs(np.corrcoef(x)[np.triu_indices(3, 1)]).max() < 5 / np.sqrt(n)
-    assert td3_of(CONFIG).draw_noise(jax.random.key(0), (1, 2)).policy is None
+    assert td3_of(CONFIG).learning_noise(jax.random.key(0), (1, 2)).policy is None
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])

@@ -11,7 +11,6 @@ from support import assert_close, random_columns, raveled, refused, shapes_of
 import sejax
 from sejax import envs
 from sejax.agents import AgentOptions, make_agent
-from sejax.agents.base import drawing_key
 from sejax.agents.buffers import Transition, block_size, num_columns, sum_over_batch
 from sejax.agents.dqn import DDQN, DDQNConfig
 from sejax.agents.exploration import CountBasedConfig
@@ -226,7 +225,7 @@ def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key()
     varied = make_agent(config, task, varied=True)
     training = sejax.TrainingConfig(max_steps=60, stop_rule="never")
     train = jax.jit(sejax.make_evaluator(varied, task.env, task, training))
-    draw = jax.jit(lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key)))
+    draw = jax.jit(lambda key: (varied.varied.draw(key), varied.drawn_values(key)))
     key = jax.random.key(0)
     (number, hparams, drawn), values = draw(key)
     assert number > 0 and drawn == values
@@ -239,4 +238,4 @@ def test_a_training_is_that_of_the_variant_with_the_numbers_drawn_from_its_key()
     assert_close(train(key, task.params), alone(key, task.params), rtol=1e-4, atol=1e-5)
     few = for_keys(varied, key[None]).varied  # which compiles this variant alone
     assert few.agents == (varied.varied.agents[int(number)],)
-    assert few.draw(drawing_key(key)) == (0, hparams, values)
+    assert few.draw(key) == (0, hparams, values)

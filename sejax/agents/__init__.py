@@ -14,7 +14,6 @@ from sejax.agents.base import AgentSpec as AgentSpec
 from sejax.agents.base import ExplorationConfig as ExplorationConfig
 from sejax.agents.base import Hparams as Hparams
 from sejax.agents.base import NoExploration as NoExploration
-from sejax.agents.base import sizes_of
 from sejax.agents.base import traced as traced
 from sejax.agents.buffers import Buffer as Buffer
 from sejax.agents.buffers import Rollout as Rollout
@@ -24,7 +23,7 @@ from sejax.agents.buffers import replay_buffer as replay_buffer
 from sejax.agents.buffers import rollout_buffer as rollout_buffer
 from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
-from sejax.envs.spec import TaskSpec
+from sejax.envs.spec import TaskSpec, sizes_of
 from sejax.options import ConfigError, registry, require
 from sejax.options.registry import require_part
 
@@ -66,14 +65,15 @@ def make_agent(
     require_part("agent", AgentConfig, config, "Pass an object, such as DDQNConfig().")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
-    is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
-    make = _make_once if is_key else _make_agent
-    return make(config, exploration, task, varied)
+    make = _make_once if registry.is_hashable((config, exploration)) else _make_agent
+    return make(config, task, exploration, varied)
 
 
 def _make_agent(
-    config: AgentConfig, exploration: ExplorationConfig, task: Task, varied: bool
+    config: AgentConfig, task: Task, exploration: ExplorationConfig, varied: bool
 ) -> Agent:
+    """`make_agent` without its checks and without its memory of agents already made."""
+
     def make(config: AgentConfig) -> Agent:
         agent = registry.make("agent", config, task)
         agent = registry.make("exploration", exploration, agent, task)

@@ -7,11 +7,12 @@ from types import SimpleNamespace
 from typing import ClassVar, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
-from sejax.envs.spec import Space
+from sejax.envs.spec import Space, sizes_of
 from sejax.options import Options, WholeNumber, marks, require
 from sejax.options.registry import require_part
 
@@ -23,7 +24,9 @@ T = TypeVar("T")
 class Hparams(SimpleNamespace):
     """Hyperparameters that an agent reads from its state, a pytree; see `traced`.
 
-    They are arguments of a compiled program if they vary, and else its constants.
+    They are arguments of a compiled program if they vary, and else its constants. An agent's own
+    names are attributes of the instance, and leaves. The two below are class attributes: only where
+    they vary does an instance have them, and a leaf for them.
 
     Attributes:
       hidden_size: units in use; None for all.
@@ -52,11 +55,6 @@ class ActFn(Protocol):
     """
 
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
-
-
-def sizes_of(observation: Space, action: Space) -> tuple[tuple[str, int], ...]:
-    """Kind and size of the observations and of the actions that an agent is made for."""
-    return tuple((type(space).__name__, space.size) for space in (observation, action))
 
 
 def require_agent(agent: "Agent", observation: Space, action: Space) -> None:
@@ -147,14 +145,28 @@ class Agent:
         runs = [make_run(agent) for agent in self.varied.agents]
 
         def run(key: Array, *args: PyTree) -> T:
-            variant, hparams, _ = draw(drawing_key(key))
-            return jax.lax.switch(variant, runs, key, *args, hparams)
+            drawn = draw(key)
+            return jax.lax.switch(drawn.variant, runs, key, *args, drawn.hparams)
 
         return run
 
     def drawn_values(self, key: Array) -> dict[str, Array]:
         """The hyperparameters that `fresh` draws for a training with this key, by name."""
-        return {} if self.varied is None else self.varied.draw(drawing_key(key))[2]
+        return {} if self.varied is None else self.varied.draw(key).values
+
+
+class Drawn(NamedTuple):
+    """Hyperparameters drawn for one training.
+
+    Attributes:
+      variant: index of its agent among `Varied.agents`, `[]` int32.
+      hparams: its traced hyperparameters, for this agent's `init`.
+      values: the drawn values, `[]` each, by field of the configuration.
+    """
+
+    variant: Array
+    hparams: Hparams
+    values: dict[str, Array]
 
 
 class Varied(NamedTuple):
@@ -162,17 +174,11 @@ class Varied(NamedTuple):
 
     Attributes:
       agents: agents of several sizes; each training takes one of them.
-      draw: `key -> (variant, hparams, values)`: the index of the training's agent, `[]` int32; its
-        traced hyperparameters; and the drawn values, `[]` each, by field of the configuration.
+      draw: `key -> Drawn`, for the key of a training.
     """
 
     agents: tuple[Agent, ...]
-    draw: Callable[[Array], tuple[Array, Hparams, dict[str, Array]]]
-
-
-def drawing_key(key: Array) -> Array:
-    """The key from which a training's hyperparameters are drawn, given the training's key."""
-    return jax.random.fold_in(key, 0x48_50)  # not `split`, which makes training and test keys
+    draw: Callable[[Array], Drawn]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,7 +267,11 @@ def traced(config: Options) -> Hparams:
 
 
 def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
-    """Traced hyperparameters with these values. A wrapped agent's are in the field `agent`."""
+    """Traced hyperparameters with these values in place of theirs.
+
+    The values belong to the innermost agent: in an agent with an intrinsic reward, to the one whose
+    hyperparameters are in the field `agent`.
+    """
     if hasattr(hparams, "agent"):
         return hparams.replace(agent=with_hparams(hparams.agent, values))
     return hparams.replace(**values)
@@ -280,7 +290,13 @@ class Algorithm(ABC):
 
     @abstractmethod
     def init(self, key: Array, hparams: Hparams) -> AgentState:
-        """A fresh agent."""
+        """A fresh agent.
+
+        Args:
+          key: of its networks.
+          hparams: traced hyperparameters, each a float32 array; `agent` sees to that. The state
+            keeps them.
+        """
 
     @abstractmethod
     def act(self, key: Array, state: AgentState, obs: Array, explore: bool) -> Array:
@@ -305,7 +321,7 @@ class Algorithm(ABC):
     def agent(self) -> Agent:
         """The bundle of these functions."""
         return Agent(
-            init=self.init,
+            init=lambda key, hparams: self.init(key, jax.tree.map(jnp.float32, hparams)),
             act=self.act,
             update=self.update,
             buffer=self.buffer(),

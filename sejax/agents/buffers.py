@@ -13,7 +13,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
-from sejax.ops.keys import WEYL, murmur
+from sejax.ops.keys import WEYL, murmur, unit_interval
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
 T = TypeVar("T")
@@ -160,10 +160,12 @@ def row_width(obs_dim: int, action_dim: int | None = None) -> int:
     return 2 * obs_dim + (action_dim or 1) + 2
 
 
-def pack(transition: Transition) -> Float[Array, " width"]:
-    """One transition as a row."""
-    obs, action, reward, discount, next_obs, _ = transition
-    parts = obs, next_obs, action, reward, discount
+def pack(step: Transition) -> Float[Array, " width"]:
+    """One transition as a row: observation, next observation, action, reward, discount.
+
+    `unpack` reads it. Its weight is left out: a stored step counts in full.
+    """
+    parts = step.obs, step.next_obs, step.action, step.reward, step.discount
     return jnp.concatenate([jnp.atleast_1d(x).astype(jnp.float32) for x in parts])
 
 
@@ -263,8 +265,7 @@ def sample_indices(
     size / 2**24.
     """
     x = murmur(seed + jnp.arange(batch_size, dtype=jnp.uint32) * jnp.uint32(WEYL))
-    fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
-    index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
+    index = (unit_interval(x) * size.astype(jnp.float32)).astype(jnp.int32)
     return jnp.minimum(index, size - 1)  # rounding may reach size
 
 

@@ -20,7 +20,7 @@ from pydantic import Field
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicy, OffPolicyOptions, adam_step
-from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
+from sejax.agents.policies import decayed_epsilon, epsilon_greedy, q_of_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.networks import DuelingMLP, init_narrowed
@@ -129,12 +129,11 @@ class DDQN(OffPolicy):
 
     def init(self, key: Array, hparams: Hparams) -> DDQNState:
         params = init_narrowed(self.network, key, self.obs_dim, hparams.hidden_size)
-        hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
             target_params=params,
             opt_state=ADAM.init(params),
-            epsilon=jnp.float32(hparams.epsilon_init),
+            epsilon=hparams.epsilon_init,
             num_steps=jnp.int32(0),
             hparams=hparams,
         )
@@ -149,10 +148,7 @@ class DDQN(OffPolicy):
         return cast(Array, self.network.apply(params, obs))
 
     def act(self, key: Array, state: DDQNState, obs: Array, explore: bool) -> Array:
-        q_values = self.q_values(state.params, obs)
-        if not explore:
-            return jnp.argmax(q_values).astype(jnp.int32)
-        return epsilon_greedy(key, q_values, state.epsilon)
+        return epsilon_greedy(key, self.q_values(state.params, obs), state.epsilon, explore)
 
     def update(self, key: Array, state: DDQNState, batch: Transition) -> DDQNState:
         """A step of Adam on the error to double-Q targets; then the target network follows.
@@ -167,7 +163,7 @@ class DDQN(OffPolicy):
             next_q = self.q_values(params, batch.next_obs) if self.config.double else target_next_q
             discount = hp.discount * batch.discount
             targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
-            predicted = select_action(self.q_values(params, batch.obs), batch.action)
+            predicted = q_of_action(self.q_values(params, batch.obs), batch.action)
             return jnp.sum(batch.weight * (predicted - jax.lax.stop_gradient(targets)) ** 2)
 
         params, opt_state = adam_step(sum_of_losses, state.params, state.opt_state, (batch,), hp)
@@ -210,4 +206,4 @@ def double_q_targets(
 
     Source: van Hasselt et al. (2016), eq. 4.
     """
-    return reward + discount * select_action(target_next_q, jnp.argmax(online_next_q, axis=0))
+    return reward + discount * q_of_action(target_next_q, jnp.argmax(online_next_q, axis=0))

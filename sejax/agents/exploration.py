@@ -31,11 +31,12 @@ from sejax.ops.optimizers import ADAM, apply_gradient
 from sejax.options import Count, Depth, Fraction, NonNegative, Positive, option, require
 
 
-def _with_bonus(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
-    """A wrapped agent with these changes.
+def _wrapped(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
+    """An agent that does as the inner `agent`, but for these changes of `Agent`'s fields.
 
-    Its state holds the inner agent's state as `agent_state`. Its hyperparameters hold the inner
-    agent's as `agent`.
+    Its state holds the inner agent's state as `agent_state`. Its hyperparameters are those of
+    `config`, and hold the inner agent's as `agent`. So `init` and `update` must be among the
+    changes: they make such a state, and give the bonus.
     """
     require(agent.varied is None, "agent", "must be varied last, by sejax.make_agent(varied=True).")
 
@@ -111,10 +112,10 @@ class ICMConfig(ExplorationConfig):
           True
         """
         module = ICM(self, task.action_dim)
-        curious = Curious(agent, module, task.obs_dim, task.num_actions is not None)
+        curious = Curious(agent, module, task.obs_dim, is_discrete=task.num_actions is not None)
         # The module's networks keep a core busy, whatever agent is inside.
         spec = dataclasses.replace(agent.spec, cpu_num_parallel=1)
-        return _with_bonus(agent, self, init=curious.init, update=curious.update, spec=spec)
+        return _wrapped(agent, self, init=curious.init, update=curious.update, spec=spec)
 
 
 class CuriousState(struct.PyTreeNode):
@@ -189,7 +190,14 @@ class ICM(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Curious:
-    """The pure functions of a curious agent."""
+    """The pure functions of a curious agent.
+
+    Attributes:
+      agent: the one inside, which gets the bonus.
+      model: the networks.
+      obs_dim: length of an observation.
+      is_discrete: whether the task's actions are indices.
+    """
 
     agent: Agent
     model: ICM
@@ -208,11 +216,12 @@ class Curious:
         )
 
     def outputs(self, params: PyTree, batch: Transition) -> ICMOutputs:
+        """What the module makes of a batch, with actions as vectors."""
         action = action_vectors(batch.action, self.model.action_width)
         return cast(ICMOutputs, self.model.apply(params, batch.obs, action, batch.next_obs))
 
     def train(self, state: CuriousState, batch: Transition) -> CuriousState:
-        """One step of Adam."""
+        """One step of Adam for the module; the agent inside stays as it is."""
         hp = state.hparams
 
         def loss_fn(params: PyTree) -> Array:
@@ -226,19 +235,23 @@ class Curious:
         return state.replace(params=params, opt_state=opt_state)
 
     def bonus(self, state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
+        """The intrinsic reward of each step: eta times the forward model's error there."""
         error = prediction_error(self.outputs(state.params, batch))
         return state.hparams.reward_scale * jax.lax.stop_gradient(error)
 
     def update(self, key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
-        augmented: Transition | Rollout
+        """The module's step, and the inner agent's on the batch with the bonus in its rewards.
+
+        On `Transition`s the module learns first, on a `Rollout` last; see `ICMConfig.make`.
+        """
         if isinstance(batch, Rollout):
             steps = batch.transitions(self.obs_dim, self.is_discrete)
-            augmented = batch.with_bonus(self.bonus(state, steps))
+            batch = batch.with_bonus(self.bonus(state, steps))
             state = self.train(state, steps)
         else:
             state = self.train(state, batch)
-            augmented = batch._replace(reward=batch.reward + self.bonus(state, batch))
-        return state.replace(agent_state=self.agent.update(key, state.agent_state, augmented))
+            batch = batch._replace(reward=batch.reward + self.bonus(state, batch))
+        return state.replace(agent_state=self.agent.update(key, state.agent_state, batch))
 
 
 def icm_loss(
@@ -351,4 +364,4 @@ class CountBasedConfig(ExplorationConfig):
                 counts=jnp.where(is_visited, count, state.counts),
             )
 
-        return _with_bonus(agent, self, init=init, update=update)
+        return _wrapped(agent, self, init=init, update=update)

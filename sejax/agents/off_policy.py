@@ -107,7 +107,11 @@ class ActorCritic(OffPolicy):
         self.critic = self.config.mlp(num_values)
 
     def sizes(self) -> tuple[int, int, int]:
-        """Outputs of the actor, inputs of a critic beside the observation, and its outputs."""
+        """Outputs of the actor, inputs of a critic beside the observation, and its outputs.
+
+        Here for an actor with a number for each action, and critics that see the action and give
+        one value. Where a critic has an output for each action, it sees none.
+        """
         return self.action_dim, self.action_dim, 1
 
     def init_networks(self, key: Array, hparams: Hparams) -> tuple[Any, Any]:

@@ -5,10 +5,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.base import Hparams
+from sejax.ops.keys import unit_interval
 
 
-def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
-    """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
+def q_of_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
+    """Q of each column's own action; or, of log probabilities in place of Q, the action's.
+
+    It chooses nothing. It reads by mask: gathers and their gradients are slow on CPU.
+
+    Args:
+      q_values: a number for each action, in each column.
+      action: `[batch]` indices.
+    """
     mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
     return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)
 
@@ -27,13 +35,16 @@ def decayed_epsilon(hparams: Hparams, episode: Array) -> Array:
 
 
 def epsilon_greedy(
-    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array, explore: bool = True
 ) -> Int[Array, ""]:
     """A uniform action with probability epsilon, else the first of the best actions.
 
-    The random bits are the key's own data: do not use the key for anything else.
+    Without `explore` (a Python bool, as in `Agent.act`) it is always the latter, and the key has no
+    effect. The random bits are the key's own data: do not use the key for anything else.
     """
+    if not explore:
+        return jnp.argmax(q_row).astype(jnp.int32)
     bits = jax.random.key_data(key)
     random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
-    uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+    uniform = unit_interval(bits[1])
     return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))

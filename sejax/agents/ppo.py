@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentOptions, AgentSpec, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
-from sejax.agents.policies import select_action
+from sejax.agents.policies import q_of_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.keys import murmur
@@ -86,10 +86,9 @@ class PPOConfig(AgentOptions):
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        length = self.rollout_length(task.max_steps)
+        sizes = task.obs_dim, task.action_dim, self.rollout_length(task.max_steps)
         if task.num_actions is not None:
-            return PPO(self, task.obs_dim, task.num_actions, length).agent()
-        sizes = task.obs_dim, task.action_dim, length
+            return PPO(self, *sizes).agent()
         return ContinuousPPO(self, *sizes, task.max_action).agent()
 
     def rollout_length(self, task_max_steps: int) -> int:
@@ -206,7 +205,7 @@ class PPO(Algorithm):
             params=params,
             opt_state=self.optimizer.init(params),
             return_moments=(jnp.zeros(()),) * 3,
-            hparams=jax.tree.map(jnp.float32, hparams),
+            hparams=hparams,
         )
 
     def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
@@ -330,7 +329,7 @@ class PPO(Algorithm):
         """The logarithms of the actions' probabilities, and the entropies, in nats."""
         log_probs = jax.nn.log_softmax(outputs, axis=0)
         entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
-        return select_action(log_probs, action), entropy
+        return q_of_action(log_probs, action), entropy
 
 
 class ContinuousPPO(PPO):

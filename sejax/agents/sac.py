@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
-from sejax.agents.policies import select_action
+from sejax.agents.policies import q_of_action
 from sejax.envs.base import Task
 from sejax.ops.optimizers import ADAM
 from sejax.options import Finite, Fraction, NonNegative, Positive, option, require
@@ -112,13 +112,13 @@ class SAC(ActorCritic):
 
     def init(self, key: Array, hparams: Hparams) -> SACState:
         actor, critics = self.init_networks(key, hparams)
-        params = Params(actor, critics, log_alpha=jnp.log(jnp.float32(hparams.init_alpha)))
+        params = Params(actor, critics, log_alpha=jnp.log(hparams.init_alpha))
         return SACState(
             params=params,
             target_critics=params.critics,
             opt_state=ADAM.init(params),
             is_warming_up=jnp.bool_(self.config.warmup_episodes > 0),
-            hparams=jax.tree.map(jnp.float32, hparams),
+            hparams=hparams,
         )
 
     def outputs(self, params: Params, obs: Array) -> Array:
@@ -134,7 +134,7 @@ class SAC(ActorCritic):
         return self.sample(key, outputs, state.is_warming_up) if explore else self.best(outputs)
 
     def update(self, key: Array, state: SACState, batch: Transition) -> SACState:
-        return self.learn(state, batch, self.draw(key, batch.reward.size))
+        return self.learn(state, batch, self.learning_noise(key, batch.reward.size))
 
     def learn(self, state: SACState, batch: Transition, noise: LearningNoise) -> SACState:
         """One step of Adam on all three losses from the same parameters, as in the authors' code.
@@ -198,7 +198,7 @@ class SAC(ActorCritic):
         """The target of the entropy, in nats."""
         return hparams.target_entropy * self.action_dim
 
-    def draw(self, key: Array, batch: int) -> LearningNoise:
+    def learning_noise(self, key: Array, batch: int) -> LearningNoise:
         """The random numbers of a learning step, for `batch` columns."""
         return LearningNoise(*jax.random.normal(key, (2, self.action_dim, batch)))
 
@@ -245,7 +245,7 @@ class DiscreteSAC(SAC):
     def target_entropy(self, hparams: Hparams) -> Array:
         return hparams.target_entropy_fraction * math.log(self.action_dim)
 
-    def draw(self, key: Array, batch: int) -> LearningNoise:
+    def learning_noise(self, key: Array, batch: int) -> LearningNoise:
         return LearningNoise(None, None)
 
     def sample(self, key: Array, outputs: Array, is_uniform: Array) -> Array:
@@ -255,7 +255,7 @@ class DiscreteSAC(SAC):
         return jnp.argmax(outputs).astype(jnp.int32)
 
     def q_values(self, critics: PyTree, obs: Array, action: Array) -> Float[Array, "2 batch"]:
-        return jax.vmap(select_action, (0, None))(self.critic_outputs(critics, obs), action)
+        return jax.vmap(q_of_action, (0, None))(self.critic_outputs(critics, obs), action)
 
     def expected(
         self, critics: PyTree, obs: Array, outputs: Array, noise: Array | None

@@ -9,7 +9,6 @@ import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
@@ -89,6 +88,7 @@ class Tabular(Algorithm):
     """The agent for observations `0..num_states-1` and actions `0..num_actions-1`.
 
     Example:
+      >>> import jax
       >>> agent = Tabular(SARSAConfig(), num_states=48, num_actions=4).agent()
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
@@ -105,10 +105,9 @@ class Tabular(Algorithm):
         return no_buffer()
 
     def init(self, key: Array, hparams: Hparams) -> TabularState:
-        hparams = jax.tree.map(jnp.float32, hparams)
         return TabularState(
             q_values=jnp.zeros(self.shape, jnp.float32),
-            epsilon=jnp.float32(hparams.epsilon_init),
+            epsilon=hparams.epsilon_init,
             hparams=hparams,
         )
 
@@ -116,10 +115,7 @@ class Tabular(Algorithm):
         return state.replace(epsilon=decayed_epsilon(state.hparams, episode))
 
     def act(self, key: Array, state: TabularState, obs: Int[Array, ""], explore: bool) -> Array:
-        q_row = row_of(state.q_values, obs)
-        if not explore:
-            return jnp.argmax(q_row).astype(jnp.int32)
-        return epsilon_greedy(key, q_row, state.epsilon)
+        return epsilon_greedy(key, row_of(state.q_values, obs), state.epsilon, explore)
 
     def update(self, key: Array, state: TabularState, batch: Transition) -> TabularState:
         hp = state.hparams

@@ -143,7 +143,7 @@ class TD3(ActorCritic):
             critic_opt_state=ADAM.init(critics),
             num_updates=jnp.int32(0),
             is_warming_up=jnp.bool_(self.config.warmup_episodes > 0),
-            hparams=jax.tree.map(jnp.float32, hparams),
+            hparams=hparams,
         )
 
     def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
@@ -151,21 +151,21 @@ class TD3(ActorCritic):
         if not explore:
             return self.best(outputs)
         key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
-        action = self.action(outputs, self.draw(key_policy, outputs.shape), state)
+        action = self.action(outputs, self.policy_noise(key_policy, outputs.shape), state)
         noise = self.max_action * jax.random.normal(key_noise, outputs.shape)
         action = self.restrict(action + state.hparams.action_noise_std * noise)
         return jnp.where(state.is_warming_up, self.warm_up(key_warm_up), action)
 
     def update(self, key: Array, state: TD3State, batch: Transition) -> TD3State:
-        return self.learn(state, batch, self.draw_noise(key, batch.action.shape))
+        return self.learn(state, batch, self.learning_noise(key, batch.action.shape))
 
-    def draw_noise(self, key: Array, shape: tuple[int, ...]) -> LearningNoise:
+    def learning_noise(self, key: Array, shape: tuple[int, ...]) -> LearningNoise:
         """The random numbers of a learning step on actions `[action_dim, batch]`."""
         key_smoothing, key_target, key_policy = jax.random.split(key, 3)
         return LearningNoise(
             smoothing=jax.random.normal(key_smoothing, shape),
-            target_policy=self.draw(key_target, shape),
-            policy=self.draw(key_policy, shape),
+            target_policy=self.policy_noise(key_target, shape),
+            policy=self.policy_noise(key_policy, shape),
         )
 
     def learn(self, state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
@@ -239,8 +239,8 @@ class TD3(ActorCritic):
 
     # Methods that discrete actions override.
 
-    def draw(self, key: Array, shape: tuple[int, ...]) -> Array | None:
-        """The randomness of `action`."""
+    def policy_noise(self, key: Array, shape: tuple[int, ...]) -> Array | None:
+        """The randomness of `action`, for outputs of this shape; None if it has none."""
         return None
 
     def action(self, outputs: Array, noise: Array | None, state: TD3State) -> Array:
@@ -266,7 +266,7 @@ class DiscreteTD3(TD3):
 
     config: DiscreteTD3Config
 
-    def draw(self, key: Array, shape: tuple[int, ...]) -> Array | None:
+    def policy_noise(self, key: Array, shape: tuple[int, ...]) -> Array | None:
         return jax.random.gumbel(key, shape)
 
     def action(self, outputs: Array, noise: Array | None, state: TD3State) -> Array:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentConfig, Hparams, Varied, drawing_key, with_hparams
+from sejax.agents.base import Agent, AgentConfig, Drawn, Varied, with_hparams
 from sejax.ops import cpu
 from sejax.options import marks, require
 
@@ -117,7 +117,8 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     batch = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
     variants = [make(dataclasses.replace(config, **batch, **network)) for network in networks]
 
-    def draw(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
+    def draw(key: Array) -> Drawn:
+        key = jax.random.fold_in(key, 0x48_50)  # whose `split` makes the training and test keys
         drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())
         values = dict(zip(ranges, drawn, strict=True))
         traced = {name: x for name, x in values.items() if name != "num_layers"}
@@ -125,7 +126,7 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
         depth = values.get("num_layers", jnp.zeros(()))
         units = values.get("hidden_size", jnp.zeros(()))
         too_small = [(n < depth) | ((n == depth) & (size < units)) for n, size in shapes]
-        return jnp.int32(sum(too_small)), hparams, values  # the smallest that has room
+        return Drawn(jnp.int32(sum(too_small)), hparams, values)  # the smallest that has room
 
     spec = agent.spec
     if len(variants) > 1:  # under vmap all branches would run
@@ -140,7 +141,7 @@ def for_keys(agent: Agent, keys: Array) -> Agent:
     """
     if (varied := agent.varied) is None:
         return agent
-    variants = jax.vmap(lambda key: varied.draw(drawing_key(key))[0])(keys)
+    variants = jax.vmap(lambda key: varied.draw(key).variant)(keys)
     return _with_variants(agent, tuple(sorted({*variants.tolist()})))
 
 
@@ -148,8 +149,8 @@ def for_keys(agent: Agent, keys: Array) -> Agent:
 def _with_variants(agent: Agent, used: tuple[int, ...]) -> Agent:
     variants, draw = cast(Varied, agent.varied)
 
-    def draw_used(key: Array) -> tuple[Array, Hparams, dict[str, Array]]:
-        variant, hparams, values = draw(key)
-        return jnp.searchsorted(jnp.array(used), variant), hparams, values
+    def draw_used(key: Array) -> Drawn:
+        drawn = draw(key)
+        return drawn._replace(variant=jnp.searchsorted(jnp.array(used), drawn.variant))
 
     return dataclasses.replace(agent, varied=Varied(tuple(variants[i] for i in used), draw_used))

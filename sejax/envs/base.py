@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sejax.envs.environment import Environment, EnvParams, spaces_of
-from sejax.envs.spec import Space, TaskSpec
+from sejax.envs.spec import Space, TaskSpec, sizes_of
 from sejax.envs.wrappers import as_vectors
 from sejax.options import ConfigError, Count, as_python, checked, require, shortened, told
 
@@ -79,8 +79,8 @@ class Task(TaskSpec):
             require_own_steps(self.env)
             env = as_vectors(self.env, params)
             observation, action = spaces_of(env, params)
-            sizes = [(type(x), x.size) for x in (observation, action)]
-            is_same = sizes == [(type(x), x.size) for x in spaces_of(env)]  # of its default_params
+            # `make_trainer` asks for the spaces without params: they are those of `default_params`.
+            is_same = sizes_of(observation, action) == sizes_of(*spaces_of(env))
             require(is_same, "env", "needs its own default_params", got=self.name)
             if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(env, params, self.name)  # takes seconds; the others have tests

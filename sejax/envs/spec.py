@@ -44,6 +44,14 @@ class Box:
 Space = Discrete | Box
 
 
+def sizes_of(observation: Space, action: Space) -> tuple[tuple[str, int], ...]:
+    """Kind and size of the observations and of the actions, `(("Box", 4), ("Discrete", 2))`.
+
+    An agent fits all spaces of the same sizes, whatever their bounds.
+    """
+    return tuple((type(space).__name__, space.size) for space in (observation, action))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TaskSpec:
     """What is known of a task without making it.

@@ -5,7 +5,7 @@ Only this module turns a sign: evosax minimises a fitness, and sejax maximises s
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,16 +20,29 @@ if TYPE_CHECKING:  # importing evosax takes a second
     from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
 
 
-# Name of the class; whether the second half of its candidates mirrors the first; the optimizer of
-# its mean: "adam", "sgd" (if its steps have a natural scale), or None if it takes no optimizer.
+class EvosaxClass(NamedTuple):
+    """A class of evosax's.
+
+    Attributes:
+      cls: its name.
+      antithetic: whether the second half of its candidates mirrors the first.
+      optimizer: of its mean: "adam", "sgd" (if its steps have a natural scale), or None if it takes
+        no optimizer.
+    """
+
+    cls: str
+    antithetic: bool = False
+    optimizer: str | None = None
+
+
 ALGORITHMS = {
-    "cma_es": ("CMA_ES", False, None),
-    "cr_fm_nes": ("CR_FM_NES", True, None),
-    "open_es": ("Open_ES", True, "adam"),
-    "pgpe": ("PGPE", True, "adam"),
-    "sep_cma_es": ("Sep_CMA_ES", False, None),
-    "snes": ("SNES", False, "sgd"),
-    "xnes": ("xNES", False, "sgd"),
+    "cma_es": EvosaxClass("CMA_ES"),
+    "cr_fm_nes": EvosaxClass("CR_FM_NES", antithetic=True),
+    "open_es": EvosaxClass("Open_ES", antithetic=True, optimizer="adam"),
+    "pgpe": EvosaxClass("PGPE", antithetic=True, optimizer="adam"),
+    "sep_cma_es": EvosaxClass("Sep_CMA_ES"),
+    "snes": EvosaxClass("SNES", optimizer="sgd"),
+    "xnes": EvosaxClass("xNES", optimizer="sgd"),
 }
 
 
@@ -58,8 +71,7 @@ class EvosaxConfig(StrategyOptions):
         super().__post_init__()
         require_known("es.name", self.name, ALGORITHMS)
         size = self.population_size
-        _, is_antithetic, _ = ALGORITHMS[self.name]
-        is_fit = size % 2 == 0 or not is_antithetic
+        is_fit = size % 2 == 0 or not ALGORITHMS[self.name].antithetic
         require(is_fit, "es.population_size", "must be even", got=size, use=size + 1)
         algorithms_with = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
         for name, algorithms in algorithms_with.items():

@@ -71,9 +71,16 @@ def while_any_active(
 def _while_any_active(
     body: Body, depth: int, per_check: int, large: PyTree, small: PyTree, consts: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """The loop under `depth` vmaps. When it is vmapped, it makes the loop one vmap deeper."""
+    """The loop under `depth` vmaps. When it is vmapped, it makes the loop one vmap deeper.
 
-    def masked_step(large: PyTree, small: PyTree, consts: PyTree) -> tuple[PyTree, PyTree]:
+    So jax never sees a `while_loop` with a batched predicate: `loop` is opaque to `vmap`, and its
+    rule writes the vmaps into the loop's body instead. `large`, `small` and `consts` have `depth`
+    leading axes, all of them the batch's. At depth 0 nothing is masked.
+    """
+
+    def batch_step(large: PyTree, small: PyTree, consts: PyTree) -> tuple[PyTree, PyTree]:
+        """One iteration of all elements; those that have stopped keep their `small`."""
+
         def step(*args: PyTree) -> tuple[PyTree, PyTree]:
             return body(*args, depth > 0)
 
@@ -86,17 +93,18 @@ def _while_any_active(
 
     # Arrays that the body closes over (a grid world's map) become arguments of the loop. Inside a
     # `cond` with a vmapped predicate they are batched, and custom_vmap refuses batched closures.
-    jaxpr, shapes = jax.make_jaxpr(masked_step, return_shape=True)(large, small, consts)
+    jaxpr, shapes = jax.make_jaxpr(batch_step, return_shape=True)(large, small, consts)
     out_tree = jax.tree.structure(shapes)
 
     @custom_vmap
     def loop(
         large: PyTree, small: PyTree, consts: PyTree, captured: PyTree
     ) -> tuple[PyTree, PyTree]:
-        masked = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, captured))
+        """The loop on flat arrays: `captured` are those that the body closes over."""
+        flat_step = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, captured))
 
         def step(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
-            return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
+            return jax.tree.unflatten(out_tree, flat_step(*jax.tree.leaves((*carry, consts))))
 
         def block(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             return jax.lax.fori_loop(0, per_check, lambda _, carry: step(carry), carry)
@@ -108,6 +116,8 @@ def _while_any_active(
 
     @loop.def_vmap
     def _(axis_size: int, in_batched: list[PyTree], *args: PyTree) -> tuple[PyTree, PyTree]:
+        """The rule for one more `vmap`: `args` are `loop`'s, with or without the new axis."""
+
         def broadcast(batched: bool, x: PyTree) -> PyTree:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
@@ -121,4 +131,5 @@ def _while_any_active(
 
 
 def _select(active: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
+    """`new` where `active`, whose axes are the first ones of both arrays, else `old`."""
     return jnp.where(active.reshape(active.shape + (1,) * (new.ndim - active.ndim)), new, old)

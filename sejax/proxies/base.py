@@ -115,7 +115,9 @@ class ProxyEnv(Environment, ABC):
         """Random weights, a nested dictionary of float32 arrays."""
 
     def params(self, weights: PyTree, discount: Array | float = 1.0) -> Any:
-        """`EnvParams` of the proxy with these weights.
+        """`EnvParams` of the proxy with these weights, as a user holds and stores them.
+
+        A trainer passes them through `prepare`, once for each training.
 
         Args:
           weights: in the form of `init_weights`.
@@ -127,6 +129,10 @@ class ProxyEnv(Environment, ABC):
         self, params: PyTree, discount: Array | float | None, limit_is_terminal: bool = False
     ) -> Any:
         """Params for the whole training of one agent, prepared once.
+
+        Only a proxy whose steps depend on the agent, or repeat work that the weights alone decide,
+        overrides it. `step_env` must take params that were not prepared, too: other libraries'
+        loops pass those.
 
         Args:
           params: of the proxy.

@@ -74,8 +74,8 @@ class RewardConfig(ProxyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_known("proxy.variant", self.variant, VARIANTS)
-        defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
-        for name, default in defaults.items():
+        for name in ("output_scale", "augmented", "zero_at_terminal"):
+            default = getattr(type(self), name)
             if getattr(self, name) != default and self.shaping.weighs_info:
                 raise self._error(name, default, f"as {self.variant} has no network")
 

@@ -227,19 +227,21 @@ class SyntheticEnv(ProxyEnv):
         inputs = self._inputs(vector, action)
         outputs = [self._apply(weights, name, inputs) for name in ("state", "reward", "done")]
         state, reward, done = outputs
-        if self._units is not None:
-            state = self._units.decode(state)
-        return state, reward[0], done[0]
+        return self._from_units(state), reward[0], done[0]
 
     def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
         """What the networks of a step see: the action, then the state in their units."""
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        return jnp.concatenate([action, self._seen(vector)])
+        return jnp.concatenate([action, self._to_units(vector)])
 
-    def _seen(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
-        """A state in the networks' own units."""
+    def _to_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
+        """A state in the networks' own units (`state_units`), as they see it."""
         return vector if self._units is None else self._units.encode(vector)
+
+    def _from_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
+        """Inverse of `_to_units`: a state that networks or noise made, in the task's units."""
+        return vector if self._units is None else self._units.decode(vector)
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self.config.initial_state == "real":
@@ -250,9 +252,8 @@ class SyntheticEnv(ProxyEnv):
             vector = noise = jax.random.normal(key, (self.task.obs_dim,))
             if self.config.initial_state == "learned":
                 vector = noise + self._apply(params.weights, "start", noise)
-            vector = vector if self._units is None else self._units.decode(vector)
             # Clipped to the limit, not beyond: a one-step SE, whose state stays, ends there.
-            vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
+            vector = jnp.clip(self._from_units(vector), -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.observe(state), state
 
@@ -312,6 +313,6 @@ class BanditEnv(SyntheticEnv):
         if self.config.reward_form == "network":
             reward = self._apply(weights, "reward", self._inputs(vector, action))
             return vector, reward[0], jnp.float32(1)
-        best = self._apply(weights, "reward", self._seen(vector))
+        best = self._apply(weights, "reward", self._to_units(vector))
         difference = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
         return vector, -jnp.abs(difference).sum(), jnp.float32(1)

@@ -55,7 +55,7 @@ def run(
     earlier_cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
     state = _begin(config.seed, directory, chunks, report)
     drawn = time.monotonic()
-    num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
+    num_trainings = bilevel.evaluate.num_trainings  # of a generation
     folder = directory.folder.resolve()
     start = len(directory.rows)
     about = TrackedRun(folder=folder, id=directory.id, generation=start, config=directory.settings)
@@ -172,7 +172,7 @@ def save_proxies(directory: RunDirectory, bilevel: Bilevel, state: LearnState, f
 def _summary(directory: RunDirectory, bilevel: Bilevel, state: LearnState) -> dict[str, Any]:
     """Writes `run.json`, unless the same is there, and returns its content."""
     file = directory.folder / "run.json"
-    num_trainings = sum(bilevel.evaluate.num_trainings)  # of a generation
+    num_trainings = bilevel.evaluate.num_trainings  # of a generation
     is_measured = state.best.generation >= 0
     means = [float(x["train_steps_mean"]) for x in directory.rows]
     counts = {
