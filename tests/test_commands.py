@@ -19,7 +19,7 @@ from support import ended, refusal
 
 import sejax
 from sejax import __main__ as program
-from sejax.options.plain import expanded
+from sejax.options.plain import with_home
 from sejax.runs import commands, runtime
 
 
@@ -119,8 +119,8 @@ def test_64_bits_are_refused_with_one_line():
 def test_a_tilde_is_the_home_folder_in_every_text(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     assert sejax.config(["run_dir=~/a"]).folder == Path("/home/me/a")
-    assert expanded("sqlite:///~/a.db") == "sqlite:////home/me/a.db"
-    assert all(expanded(text) == text for text in ("a~", "~me/a", "/a/~/b", "a:b"))
+    assert with_home("sqlite:///~/a.db") == "sqlite:////home/me/a.db"
+    assert all(with_home(text) == text for text in ("a~", "~me/a", "/a/~/b", "a:b"))
 
 
 def test_there_are_as_many_devices_as_any_run_of_a_sweep_needs():

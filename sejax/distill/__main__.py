@@ -26,7 +26,7 @@ from sejax.distill.policies import CopyConfig, copy_policy
 from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import diverged_last, grades, students
 from sejax.ops.files import as_file_name, write_text
-from sejax.options import Count, registry
+from sejax.options import Count, registry, require
 from sejax.options.plain import defaults_of, flatten, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact, require_vectors
@@ -81,12 +81,8 @@ class DistillConfig(CommandConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        spec = envs.spec_of(self.env)
-        task_name = registry.name_of("env", self.env)
-        require_vectors(spec, task_name)
-        for key, agent in self.agents.items():
-            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
-            self.require_learning(key, "training", self.training, ONE_STEP, spec)
+        require_vectors(envs.spec_of(self.env), registry.name_of("env", self.env))
+        self.require_agents(self.env, ONE_STEP)
 
     @classmethod
     def default_layers(cls, typed: Tree) -> dict[str, Tree]:
@@ -97,7 +93,7 @@ class DistillConfig(CommandConfig):
         """
         known = defaults_of(cls)
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
-        env = env_in(typed.get("env", {}))
+        env = env_in(typed)
         actions = envs.spec_of(env).actions
         if not names_of(typed["agents"]):
             students = {name: {"name": name} for name in agents.USUAL[actions]}
@@ -153,8 +149,9 @@ def distill(config: DistillConfig, words: str = "") -> Path:
     """
     with Store(config.folder, config.plain(), free=config.free) as store:
         if store.get(BEGUN) is None:  # it raises for other settings
-            for name in filter(lambda name: store.file(name).exists(), ("proxy", "checkpoint")):
-                raise store.refused(f"must hold no {name} of another command; got {store.folder}")
+            found = [name for name in ("proxy", "checkpoint") if store.file(name).exists()]
+            rule = f"must hold no {' or '.join(found)} of another command"
+            require(not found, "run_dir", rule, got=store.folder, use="FOLDER")
         return _distilled(config, store, words)
 
 

@@ -127,8 +127,7 @@ def require_package(field: str, package: str, extra: str) -> None:
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """The error for an unknown choice; it lists known names, nearest first, and an override."""
     ranked = nearest(got, known)
-    rule = f"must be one of {listed(ranked)}; got {shortened(got)!r}"
-    return ConfigError(field, rule, use=ranked[0])
+    return ConfigError(field, f"must be one of {listed(ranked)}", got=repr(got), use=ranked[0])
 
 
 def nearest(got: str, known: Iterable[str]) -> list[str]:

@@ -14,6 +14,11 @@ GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True, "num_seed
 INSTEAD = {"num_seeds": "seed=0,1,2"}
 
 
+def is_gone(field: str, value: object) -> bool:
+    """Whether a field of earlier versions has the value that changes nothing."""
+    return field in GONE and GONE[field] == value
+
+
 def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration in the form in which files are written today.
 

@@ -70,7 +70,7 @@ def plugin(group: str, by_key: bool = False) -> Any:
 
     The default is sejax's own first plugin; by keys there is none.
     """
-    first = {"name": next(iter(registry.BUILT_IN[group]))}
+    first = {"name": registry.names(group)[0]}
     factory: Any = dict if by_key else functools.partial(configure, group, first)
     return dataclasses.field(default_factory=factory, metadata={"plugin": group})
 
@@ -124,12 +124,11 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     group = getattr(cls, "group", where)
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
-        if name not in defaults and old.GONE.get(f"{group}.{name}", MISSING) == value:
-            continue
-        if name not in defaults:
-            raise unknown_field(f"{where}.{shortened(name)}".lstrip("."), full.values())
-        field = _Field(full[name], defaults[name], marks(cls, name).get("plugin"))
-        fields[name] = _read(value, hints[name], field)
+        if name in defaults:
+            field = _Field(full[name], defaults[name], marks(cls, name).get("plugin"))
+            fields[name] = _read(value, hints[name], field)
+        elif not old.is_gone(f"{group}.{name}", value):
+            raise unknown_field(f"{where}.{name}".lstrip("."), full.values())
     for name, default in defaults.items():
         is_known = name in fields or default is not MISSING
         require(is_known, full[name], "must be given; it has no default", use="VALUE")
@@ -222,7 +221,7 @@ def _leaf(value: Any, hint: Any, field: _Field) -> Any:
     """A number, a text or a list, which may stand as an override's text: read, or else as it is."""
     reading = value
     if isinstance(value, str):
-        value = expanded(value)
+        value = with_home(value)
         reading = parsed(value)
     elif type(value) in (int, float):
         value = str(value)  # it may be a name of digits, such as a folder's
@@ -302,11 +301,11 @@ def split(text: str) -> list[str]:
     return [part.strip() for part in parts] if len(parts) > 1 else parts
 
 
-def expanded(text: str) -> str:
+def with_home(text: str) -> str:
     """A text in which the user's home folder replaces a path's `~`.
 
     Example:
-      >>> expanded("ppo:~/model.zip") == "ppo:" + os.path.expanduser("~/model.zip")
+      >>> with_home("ppo:~/model.zip") == "ppo:" + os.path.expanduser("~/model.zip")
       True
     """
     return re.sub(r"(^|:|:///)~(?=/|$)", lambda match: match[1] + os.path.expanduser("~"), text)

@@ -17,7 +17,7 @@ import numpy as np
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops import checksummed
 from sejax.options import LARGEST, ConfigError, old, registry, require, shortened, unknown_name
-from sejax.options.plain import configure, expanded, from_plain, require_typed
+from sejax.options.plain import configure, from_plain, require_typed, with_home
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -160,7 +160,7 @@ def find(source: str | Path, option: str = "source") -> Path:
     name = str(source)
     if hub.is_address(name):
         return hub.fetch(name, option)
-    path = expanded(name)
+    path = with_home(name)
     file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path
     if os.path.isfile(file):
         return Path(file)

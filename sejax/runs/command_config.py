@@ -9,7 +9,7 @@ Example:
   >>> from sejax.runs.config import LearnConfig
   >>> words = ["agent.learning_rate=1e-3"]
   >>> trees_of(words, LearnConfig.groups())
-  [{'agents': {}, 'agent': {'learning_rate': '1e-3'}}]
+  ({'agents': {}}, {'agents': {}, 'agent': {'learning_rate': '1e-3'}})
   >>> layers = LearnConfig.layers_of(words)  # each lies over those before it
   >>> list(layers), layers["typed"]
   (['default', 'preset=best', 'typed'], {'agents': {'ddqn': {'learning_rate': '1e-3'}}})
@@ -40,7 +40,7 @@ from sejax.options.plain import (
     unknown_field,
 )
 from sejax.proxies import ProxyConfig
-from sejax.runs.words import Tree, by_agent, expand, names_of, trees_of, typed_name
+from sejax.runs.words import Tree, by_agent, expand, trees_of, typed_name
 from sejax.training import TrainingConfig, require_reachable
 
 PLACES = ("devices", "machines", "run_dir", "out_dir")  # fields that say where, not what
@@ -53,7 +53,7 @@ class CommandConfig(Options, ABC):
     Attributes:
       folder_field: the field that names the folder of the command's files.
       named_by: fields that the default folder is named by.
-      granted: words that `--help` adds, as the command needs them.
+      help_words: words that `--help` adds, as the command needs them.
       free: fields and groups that may change when the command is repeated, which goes on with what
         the folder holds.
       agents: configurations by key, in the keys' order; `agent=ddqn` has the key `ddqn`.
@@ -67,7 +67,7 @@ class CommandConfig(Options, ABC):
     folder_field: ClassVar[str] = "run_dir"
     named_by: ClassVar[Collection[str]] = ()
     free: ClassVar[Collection[str]] = ()
-    granted: ClassVar[Sequence[str]] = ()
+    help_words: ClassVar[Sequence[str]] = ()
 
     agents: dict[str, AgentConfig] = plugin("agent", by_key=True)
     exploration: ExplorationConfig = plugin("exploration")
@@ -149,14 +149,14 @@ class CommandConfig(Options, ABC):
     @classmethod
     def layers_of(cls, overrides: Sequence[str]) -> dict[str, Tree]:
         """The layers that words make, by their names; the words themselves are the last one."""
-        trees = trees_of(overrides, cls.groups())
-        typed = merge(*trees)
-        require_typed(typed, trees[-1])
+        file, words = trees_of(overrides, cls.groups())
+        typed = merge(file, words)
+        require_typed(typed, words)
         layers = cls.default_layers(typed)
         below = merge(*layers.values())
-        require_typed(below, trees[-1])
-        agent_names = names_of(below["agents"])
-        return layers | {"typed": merge(*(by_agent(tree, agent_names) for tree in trees))}
+        require_typed(below, words)
+        keys = below["agents"]
+        return layers | {"typed": merge(by_agent(file, keys), by_agent(words, keys))}
 
     @classmethod
     def of_tree(cls, tree: Tree) -> Self:
@@ -170,8 +170,7 @@ class CommandConfig(Options, ABC):
         is_map = isinstance(by_key, Mapping) and all(x == registry.key_of(str(x)) for x in by_key)
         require(is_map, "agents", "must be agents by their keys", got=by_key, use="[ddqn,ppo]")
         config = from_plain(cls, {k: x for k, x in tree.items() if k in known}, "")
-        gone = old.GONE.items()  # by equality: values may have no hash
-        unknown = {k: x for k, x in tree.items() if k not in known and (k, x) not in gone}
+        unknown = {k: x for k, x in tree.items() if k not in known and not old.is_gone(k, x)}
         if unknown:
             name = next(iter(flatten(unknown) or unknown))
             raise unknown_field(name, config.named(config.plain()))
@@ -200,6 +199,18 @@ class CommandConfig(Options, ABC):
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
         flat = {typed_name(name, self.agents): x for name, x in flatten(tree).items()}
         return {name.removesuffix(".name"): x for name, x in flat.items()}
+
+    def require_agents(self, env: registry.Makes[envs.Task], proxy: ProxyConfig) -> None:
+        """Checks that each agent fits a task, and learns something on a proxy of it.
+
+        Raises:
+          ConfigError: if one does not.
+        """
+        spec = envs.spec_of(env)
+        task_name = registry.name_of("env", env)
+        for key, agent in self.agents.items():
+            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
+            self.require_learning(key, "training", self.training, proxy, spec)
 
     def require_learning(
         self, key: str, group: str, training: TrainingConfig, proxy: ProxyConfig, spec: TaskSpec

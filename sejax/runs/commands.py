@@ -71,19 +71,18 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
 
     If a value is not the default, the layer that sets it stands beside it.
     """
-    overrides = [*command.granted, *expand(overrides)[0]]  # the first run of a sweep
-    choices = ("agent", *command.groups())
+    overrides = [*command.help_words, *expand(overrides)[0]]  # the first run of a sweep
     layers = command.layers_of(overrides)
     tree = merge(*layers.values())
     config = command.of_tree(tree)
     lines = [str(about), "Choices (group=choice):"]
-    for group in choices:
-        prefixes = ["gymnax/ID"] if group == "env" else []
+    for group in ("agent", *command.groups()):
+        prefixes = [f"{prefix}ID" for prefix in registry.PREFIXES if group == "env"]
         names = ", ".join([*registry.names(group), *prefixes, "module:attribute"])
         lines += [textwrap.fill(f"  {group}: {names}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if "preset" in vars(config):
-        known = presets.sections_of(*(presets.choice(tree.get(x, {}), x) for x in ("env", "proxy")))
+        known = presets.sections_of(*(presets.chosen(tree, x) for x in ("env", "proxy")))
         lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
@@ -91,8 +90,8 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
     sources = dict[str, str]()
     for layer, values in layers.items():
         sources |= dict.fromkeys(config.named(values), "" if layer == "default" else f" ({layer})")
-    named = (*choices, *map(config.field_of, config.agents))
-    fields = {name: x for name, x in config.named(config.plain()).items() if name not in named}
+    choices = (*command.groups(), *map(config.field_of, config.agents))
+    fields = {name: x for name, x in config.named(config.plain()).items() if name not in choices}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
 
 

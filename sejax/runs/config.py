@@ -14,11 +14,11 @@ from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.es.base import Strategy
 from sejax.objectives import Objective
 from sejax.ops.files import as_file_name
-from sejax.options import ConfigError, Count, Options, old, registry, require, shortened
+from sejax.options import ConfigError, Count, Options, old, registry, require
 from sejax.options.plain import configure, merge, plugin, require_typed, unknown_field
 from sejax.proxies import ProxyConfig
 from sejax.runs.command_config import PLACES, CommandConfig
-from sejax.runs.presets import choice, preset_of
+from sejax.runs.presets import chosen, preset_of
 from sejax.runs.trackers import Tracker
 from sejax.runs.words import Tree, names_of
 
@@ -92,23 +92,20 @@ class LearnConfig(CommandConfig):
         super().__post_init__()
         is_here = self.devices is None or not self.machines.is_elsewhere
         require(is_here, "devices", "must be left out with machines. Set machines.workers=N.")
-        spec = envs.spec_of(self.env)
-        task_name = registry.name_of("env", self.env)
-        self.proxy.require_task(spec, task_name)
-        is_alone = len(self.agents) == 1
+        self.proxy.require_task(envs.spec_of(self.env), registry.name_of("env", self.env))
         given = self.mixture.weights
-        is_idle = is_alone and self.mixture != MixtureConfig()
-        require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
-        if unknown := given.keys() - self.agents.keys():
+        if len(self.agents) == 1:
+            is_idle = self.mixture != MixtureConfig()
+            require(not is_idle, "mixture", "must come with several agents. Set agents=[ddqn,ppo].")
+        elif unknown := given.keys() - self.agents.keys():
             known = [f"mixture.weights.{x}" for x in self.agents]
-            raise unknown_field(f"mixture.weights.{shortened(min(unknown))}", known)
-        weights = {} if is_alone else {key: given.get(key, 1.0) for key in self.agents}
-        are_some = is_alone or any(weights.values())
-        require(are_some, "mixture.weights", "must have one above 0. Leave one of them out.")
-        object.__setattr__(self, "mixture", dataclasses.replace(self.mixture, weights=weights))
-        for key, agent in self.agents.items():
-            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
-            self.require_learning(key, "training", self.training, self.proxy, spec)
+            raise unknown_field(f"mixture.weights.{min(unknown)}", known)
+        else:
+            weights = {key: given.get(key, 1.0) for key in self.agents}
+            rule = "must have one above 0. Leave one of them out."
+            require(any(weights.values()), "mixture.weights", rule)
+            object.__setattr__(self, "mixture", dataclasses.replace(self.mixture, weights=weights))
+        self.require_agents(self.env, self.proxy)
 
     @classmethod
     def of_stored(cls, values: Mapping[str, Any], typed: Mapping[str, Any] | None = None) -> Self:
@@ -162,7 +159,7 @@ class LearnConfig(CommandConfig):
         """The choice of agents, and the preset."""
         agent_names = names_of(typed["agents"])
         if not agent_names:
-            default = default_agent(typed.get("env", {}))
+            default = default_agent(typed)
             agent_names = {default: default}
         of_agents = {"agents": {key: {"name": name} for key, name in agent_names.items()}}
         preset = preset_of(merge(of_agents, typed))
@@ -193,17 +190,17 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
     return LearnConfig.of_words(overrides)
 
 
-def default_agent(env: Tree) -> str:
-    """The default agent of a task, of which plain values are given."""
+def default_agent(tree: Tree) -> str:
+    """The default agent of a tree's task."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
-        return agents.default_for(envs.spec_of(env_in(env)))
-    return choice({}, "agent")
+        return agents.default_for(envs.spec_of(env_in(tree)))
+    return chosen({}, "agent")
 
 
-def env_in(env: Tree) -> Any:
-    """The configuration of a task, of which plain values are given.
+def env_in(tree: Tree) -> Any:
+    """The configuration of a tree's task.
 
     Raises:
-      ConfigError: if they describe no task that may be made.
+      ConfigError: if the tree describes no task that may be made.
     """
-    return configure("env", {"name": choice(env, "env")} | env)
+    return configure("env", {"name": chosen(tree, "env")} | tree.get("env", {}))

@@ -11,7 +11,6 @@ import jax
 import pandas as pd
 
 from sejax import agents, envs
-from sejax.agents import AgentConfig
 from sejax.evaluation import evaluate_agents
 from sejax.options import ConfigError, Count, registry, require
 from sejax.options.plain import configure, flatten, merge, require_typed, to_plain
@@ -19,7 +18,7 @@ from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs.command_config import CommandConfig
 from sejax.runs.config import default_agent
-from sejax.runs.words import Tree, names_of
+from sejax.runs.words import Tree, drop_other_choices, names_of
 from sejax.training import TrainingConfig
 
 # Training on the real task.
@@ -59,7 +58,7 @@ class FreshAgentsConfig(CommandConfig):
     """
 
     folder_field = "out_dir"
-    granted = ("proxy=RUN_DIR",)
+    help_words = ("proxy=RUN_DIR",)
 
     proxy: str
     env: str | None = None
@@ -100,13 +99,11 @@ class FreshAgentsConfig(CommandConfig):
             fix = "Set agent_hparams=default."
             require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and is_as_learned:
-            stored_name = learned["exploration"]["name"]
-            if typed.get("exploration", {}).get("name", stored_name) != stored_name:
-                del learned["exploration"]
+            drop_other_choices(learned, typed, ["exploration"])
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
         if not names:
-            env = {"name": typed.get("env", "cartpole")}
-            name = agents.default_for(stored.spec) if stored else default_agent(env)
+            task = {"env": {"name": typed.get("env", "cartpole")}}
+            name = agents.default_for(stored.spec) if stored else default_agent(task)
             names = {name: name}
         known = learned.get("agents", {}) if hparams is None else {}
         of_agents = {key: agent_like(known, key, name) for key, name in names.items()}
@@ -152,25 +149,16 @@ def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
     require(is_given, "env", "must be given with proxy=real. Set env=cartpole.")
     proxy = None if config.proxy == "real" else loaded(config)
     task = envs.make(str(config.env)) if proxy is None else proxy.task
-    real_training = config.real_training
-    trainings = {}
     for key, agent in config.agents.items():
         agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
-        group, training = "real_training", real_training
-        if config.training_from == "config":
-            group, training = "training", config.training
-        elif proxy is not None and not proxy.env.is_real:  # RNs: as on the real task
-            group, training = "training", _as_learned(proxy, config, agent)
-        if proxy is not None:
-            config.require_learning(key, group, training, proxy.env.config, task)
-        trainings[key] = training
-    is_varied = config.agent_hparams == "varied"
-    if proxy is not None and config.agent_hparams == "as_learned":
-        is_varied = proxy.config.get("agent_hparams") == "varied"
-    on_task = World(task.env, task.params, task, dict.fromkeys(trainings, real_training), is_varied)
+    trainings = dict.fromkeys(config.agents, config.real_training)
+    on_task = World(task.env, task.params, task, trainings, config.agent_hparams == "varied")
     if proxy is None:
         return {"the real task": on_task}
-    on_proxy = World(proxy.env, proxy.params, task, trainings, is_varied)
+    if config.agent_hparams == "as_learned":
+        on_task = on_task._replace(is_varied=proxy.config.get("agent_hparams") == "varied")
+    trainings = {key: training_on(proxy, config, key) for key in config.agents}
+    on_proxy = World(proxy.env, proxy.params, task, trainings, on_task.is_varied)
     return {"the proxy": on_proxy, "the real task": on_task}
 
 
@@ -196,12 +184,23 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     return proxy
 
 
-def _as_learned(proxy: Proxy, config: FreshAgentsConfig, agent: AgentConfig) -> TrainingConfig:
-    """How long agents train on an SE, by the SE's file."""
-    use = "config training.max_steps=2000 training.max_episodes=2000"
-    require("training" in proxy.config, "training_from", "must be config for this SE", use=use)
-    test_episodes = config.real_training.test_episodes
-    return dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
+def training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingConfig:
+    """How long an agent trains on a proxy; see `FreshAgentsConfig.training_from`.
+
+    Raises:
+      ConfigError: if the proxy's file does not say it, or the agent would learn nothing.
+    """
+    group, training = "training", config.training
+    if config.training_from == "proxy" and proxy.env.is_real:
+        group, training = "real_training", config.real_training
+    elif config.training_from == "proxy":
+        use = "config training.max_steps=2000 training.max_episodes=2000"
+        require("training" in proxy.config, "training_from", "must be config for this SE", use=use)
+        test_episodes = config.real_training.test_episodes
+        training = training_of(proxy, config.agents[key])
+        training = dataclasses.replace(training, test_episodes=test_episodes)
+    config.require_learning(key, group, training, proxy.env.config, proxy.task)
+    return training
 
 
 def train(config: FreshAgentsConfig, world: World, key: str) -> dict[str, Any]:

@@ -8,9 +8,7 @@ A user's file holds overrides.
 """
 
 import functools
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -25,25 +23,29 @@ BASES, GENERAL = "bases", "general"  # files of sections to build on, and for ta
 
 
 @functools.cache
-def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+def sections_of(env: str, proxy: str) -> dict[str, Tree]:
     """The presets of a task and proxy by name: those of its file, and those of all tasks.
 
     Each preset includes the section that it builds on. That section must stand before it.
     """
-    sections: dict[str, dict[str, Any]] = {"best": {}}
-    bases: dict[str, dict[str, Any]] = {}
-    for stem in (BASES, f"{GENERAL}-{proxy}", f"{env}-{proxy}"):
-        known = bases | {GENERAL: sections["best"]}
-        for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
-            like = section.pop("like", None)
-            known[name] = merge(known[like] if like else {}, section)
-            (bases if stem == BASES else sections)[name] = known[name]
+    bases = _sections_in(BASES, {})
+    general: dict[str, Tree] = {"best": {}} | _sections_in(f"{GENERAL}-{proxy}", bases)
+    return general | _sections_in(f"{env}-{proxy}", bases | {GENERAL: general["best"]})
+
+
+def _sections_in(stem: str, known: dict[str, Tree]) -> dict[str, Tree]:
+    """The sections of a file, which may build on known ones."""
+    sections: dict[str, Tree] = {}
+    for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
+        like = section.pop("like", None)
+        below = (known | sections)[like] if like else {}
+        sections[name] = merge(below, section)
     return sections
 
 
-def choice(fields: Mapping[str, Any], group: str) -> str:
-    """The name of a group's choice in its fields; sejax's own first one if none is typed."""
-    return str(fields.get("name", next(iter(registry.BUILT_IN[group]))))
+def chosen(tree: Tree, group: str) -> str:
+    """The name of a group's choice in a tree; sejax's own first one if the tree has none."""
+    return str(tree.get(group, {}).get("name", registry.names(group)[0]))
 
 
 def preset_of(typed: Tree) -> Tree:
@@ -59,20 +61,20 @@ def preset_of(typed: Tree) -> Tree:
       ConfigError: for an unknown proxy or preset, or a preset that the task does not have.
     """
     name = str(typed.get("preset", "best"))
-    env, proxy, es = (choice(typed.get(group, {}), group) for group in ("env", "proxy", "es"))
+    env, proxy, es = (chosen(typed, group) for group in ("env", "proxy", "es"))
     sections = sections_of(env, proxy)
     require_known("preset", name, sections)
     section = sections[name]
-    default = registry.find("proxy", proxy).default_objective
-    objective = merge({"name": default}, section.get("objective", {}), typed.get("objective", {}))
+    default = {"objective": {"name": registry.find("proxy", proxy).default_objective}}
+    objective = chosen(merge(default, section, typed), "objective")
     of_names = section.get("with_agent", {})
     beside = {key: of_names.get(x, {}) for key, x in names_of(typed["agents"]).items()}
     settings = merge(
         {key: x for key, x in section.items() if not key.startswith("with_")},
         section.get("with_es", {}).get(es, {}),
-        section.get("with_objective", {}).get(str(objective["name"]), {}),
+        section.get("with_objective", {}).get(objective, {}),
         *(beside.values() if len(beside) == 1 else ()),
-        {"objective": {"name": objective["name"]}, "preset": name},
+        {"objective": {"name": objective}, "preset": name},
         {"agents": {key: x.get("agent", {}) for key, x in beside.items()}},
     )
     return {key: x for key, x in settings.items() if key != "agent"}

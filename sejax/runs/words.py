@@ -26,13 +26,11 @@ from typing import Any, TypeAlias
 import yaml
 
 from sejax.options import ConfigError, old, registry, require, shortened
-from sejax.options.plain import expanded, flatten, merge, split, unquoted
+from sejax.options.plain import flatten, merge, split, unquoted, with_home
 
 Tree: TypeAlias = dict[str, Any]  # nested plain values
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
-# A choice may stand beside its fields, as in config.yaml.
-CHOICES = {f"{group}.name": group for group in registry.GROUPS}
-CHOOSE_ALL = {"agent", "agents"}  # words that choose all agents
+CHOOSE_ALL = {"agent", "agent.name", "agents"}  # words that choose all agents
 # `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
 BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
 # What reading a file of YAML may raise.
@@ -65,12 +63,12 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
         use = shortened(f"{text.rstrip(',')}]" if is_open else first)
         rule = "must be one value; a list stands in brackets, without spaces"
         require(not (others or is_open), name, rule, got=text, use=use)
-        texts[CHOICES.get(name, name)] = text
+        texts[name] = text
     return texts
 
 
-def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
-    """The tree of words; before it the one of the file that `preset=FILE.yaml` names.
+def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, Tree]:
+    """The tree of the file that `preset=FILE.yaml` names, empty without one; the tree of the words.
 
     Args:
       overrides: as typed after a command.
@@ -81,21 +79,17 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
 
     Example:
       >>> trees_of(["agent=ddqn", "es.noise_std=0.1"], ["es"])
-      [{'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}}]
+      ({'agents': {}}, {'agents': {'ddqn': {'name': 'ddqn'}}, 'es': {'noise_std': '0.1'}})
     """
     texts: Tree = {name: unquoted(text) for name, text in texts_of(overrides).items()}
     if not texts.get("preset", "").endswith((".yaml", ".yml")):
-        return [_tree(texts, groups)]
-    path = Path(expanded(texts.pop("preset")))
+        return {"agents": {}}, _tree(texts, groups)
+    path = Path(with_home(texts.pop("preset")))
     typed = _tree(texts, groups)
     try:
-        values = flatten(old.upgraded(yaml.safe_load(path.read_text(encoding="utf-8"))))
-        file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
-        for group in groups:  # fields of a choice that a typed one replaces
-            name = typed.get(group, {}).get("name")
-            if name is not None and file.get(group, {}).get("name", name) != name:
-                del file[group]
-        return [drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed]
+        file = _tree(flatten(yaml.safe_load(path.read_text(encoding="utf-8"))), groups)
+        drop_other_choices(file, typed, groups)
+        return drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed
     except ConfigError:  # it is readable
         raise
     except UNREADABLE as error:
@@ -104,15 +98,24 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> list[Tree]:
 
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
-    """Values by their names in words as a tree; see above for agents."""
+    """Values by their names in words as a tree: `env=acrobot` is `env.name=acrobot`."""
     tree: Tree = {"agents": chosen_agents(values)}
     for name in [name for name in values if name not in CHOOSE_ALL]:
-        value = values[name]
         is_choice = name in groups or BY_KEY.fullmatch(name)
-        for part in reversed([*name.split("."), *(["name"] if is_choice else [])]):
+        path = f"{name}.name" if is_choice else name
+        value = values[name]
+        for part in reversed(path.split(".")):
             value = {part: value}
         tree = merge(tree, value)
     return old.upgraded(tree)
+
+
+def drop_other_choices(below: Tree, typed: Tree, groups: Iterable[str]) -> None:
+    """Removes the fields of each choice that a typed one replaces."""
+    for group in groups:
+        name = typed.get(group, {}).get("name")
+        if name is not None and below.get(group, {}).get("name", name) != name:
+            del below[group]
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -137,7 +140,7 @@ def chosen_agents(values: Mapping[str, Any]) -> Tree:
       ConfigError: if both words are there, or one names an agent twice or none.
     """
     known: list[str] = []
-    for word in [word for word in values if word in CHOOSE_ALL]:
+    for word in [word for word in values if word in CHOOSE_ALL and values[word] is not None]:
         text = str(values[word])
         is_list = text.startswith("[") and text.endswith("]")
         names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
