@@ -27,12 +27,19 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     new = {k: x for k, x in config.items() if x is not None or k not in ("agent", "agents")}
     if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
         new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
-    if isinstance(agents := new.setdefault("agents", {}), Mapping) and "mixture" not in new:
-        of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
-        by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
-        are_several = len(by_key) > 1
-        weights = {k: x.pop("weight") for k, x in by_key.items() if are_several and "weight" in x}
-        if of_all or weights:
-            new["mixture"] = of_all | {"weights": weights}
-        new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
+    agents = new.setdefault("agents", {})
+    if isinstance(agents, Mapping) and "mixture" not in new:
+        new |= _without_mixture(agents)
     return new
+
+
+def _without_mixture(agents: Mapping[str, Any]) -> dict[str, Any]:
+    """The agents, and beside them the settings of their mixture that stood among them."""
+    of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
+    by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
+    weights = {}
+    if len(by_key) > 1:  # an only agent may have a field of this name
+        weights = {key: x.pop("weight") for key, x in by_key.items() if "weight" in x}
+    mixture = {"mixture": of_all | {"weights": weights}} if of_all or weights else {}
+    others = {key: x for key, x in agents.items() if key not in of_all}
+    return mixture | {"agents": others | by_key}

@@ -83,31 +83,41 @@ class FreshAgentsConfig(CommandConfig):
             the file has none.
         """
         require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE or cartpole")
-        # As --print-config has it, whose output may come as preset=FILE.yaml.
-        printed = to_plain(TrainingConfig())
-        is_default = merge({"training": printed}, typed)["training"] == printed
-        is_used = is_default or typed.get("training_from") == "config"
-        require(is_used, "training", "must come with training_from=config, or be real_training.*.")
-        names = names_of(typed["agents"])
-        hparams = typed.get("agent_hparams")
-        is_as_learned = hparams == "as_learned" or (not names and hparams is None)
+        require_read(typed)
         stored = stored_header(str(typed["proxy"]))
         learned = learned_layer(stored.config) if stored else {}
-        if stored and hparams == "as_learned":
-            require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-            are_same = names in ({}, names_of(learned["agents"]))
-            fix = "Set agent_hparams=default."
-            require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
-        if learned and is_as_learned:
-            drop_other_choices(learned, typed, ["exploration"])
-            return {"proxy": learned | {"agent_hparams": "as_learned"}}
+        drop_other_choices(learned, typed, ["exploration"])
+        as_learned: Tree = {"proxy": learned | {"agent_hparams": "as_learned"}}
+        names = names_of(typed["agents"])
+        known: Tree = {}  # agents whose hyperparameters those of the same name take
+        match typed.get("agent_hparams"):
+            case "as_learned" if stored:
+                require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
+                are_same = names in ({}, names_of(learned["agents"]))
+                fix = "Set agent_hparams=default."
+                require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
+                return as_learned
+            case None if learned and not names:
+                return as_learned
+            case None if learned:
+                known = learned["agents"]
         if not names:
             task = {"env": {"name": typed.get("env", "cartpole")}}
             name = agents.default_for(stored.spec) if stored else default_agent(task)
             names = {name: name}
-        known = learned.get("agents", {}) if hparams is None else {}
         of_agents = {key: agent_like(known, key, name) for key, name in names.items()}
         return {"proxy": {"agents": of_agents}}
+
+
+def require_read(typed: Tree) -> None:
+    """Checks that fields of `training`, if any are typed, are read.
+
+    Defaults may stand there: `--print-config` writes them, and its file may come as a preset.
+    """
+    printed = {"training": to_plain(TrainingConfig())}
+    is_default = merge(printed, typed)["training"] == printed["training"]
+    is_read = is_default or typed.get("training_from") == "config"
+    require(is_read, "training", "must come with training_from=config, or be real_training.*.")
 
 
 def stored_header(proxy: str) -> header.Header | None:
