@@ -18,10 +18,10 @@ import contextlib
 import dataclasses
 import functools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import pandas as pd
@@ -57,7 +57,7 @@ ARS |= {"step_size": 0.3, "policy_error": 0.0, "num_tests": 10, "test_every": 1}
 MYOPIC, OWN, OTHERS = "the proxy, discount {:g}", "the proxy", "the proxy, other algorithms"
 NULL, TASK, TUNED, NOTHING = "the null SE", "the real task", "the real task, tuned", "nothing"
 SHOWN = {"return": ("test_return", 1), "training steps": ("train_steps", 0)}
-Rows: TypeAlias = dict[str, tuple[World, Iterable[str]]]  # where agents train, and their keys
+Agents: TypeAlias = dict[str, agents.AgentConfig]  # by key
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -127,43 +127,22 @@ def check(proxy: str | Path, **fields: object) -> dict[str, Any]:
 def findings(config: CheckConfig) -> dict[str, Any]:
     """Trains the agents whose results are missing, and reports the findings; see `check`."""
     proxy = _judgeable(config)
-    task = proxy.task
-    learned: dict[str, Any] = config.agents
-    others = _others(config, task)
-    students = learned | others
-    myopic = {}  # keys of agents, by row
-    if proxy.env.max_steps > 1:  # in one step a discount has no effect
-        for discount in DISCOUNTS:
-            of_row = {f"{key}-{discount:g}": agent for key, agent in learned.items()}
-            students |= {k: dataclasses.replace(x, discount=discount) for k, x in of_row.items()}
-            myopic[MYOPIC.format(discount)] = list(of_row)
-    worlds = fresh_agents.worlds_of(dataclasses.replace(config, agents=students)).values()
-    on_proxy, on_task = (world._replace(is_varied=False) for world in worlds)
-    tuned = "tuned" if "tuned" not in learned else "tuned-on-the-task"
-    on_task = on_task._replace(trainings=on_task.trainings | {tuned: config.real_training})
-    config = dataclasses.replace(config, agents=students | {tuned: _tuned(task)})
-    settings = config.plain() | {"task": task.origin, "discount": proxy.discount}
+    rows = _rows_on_proxy(config, proxy)
+    rows_on_task = _rows_on_task(config, proxy)
+    settings = config.plain() | {"task": proxy.task.origin, "discount": proxy.discount}
     settings["proxy"] = {"weights": proxy.fingerprint} | to_plain(proxy.env.config, "proxy")
-    settings["trainings"] = to_plain(on_proxy.trainings)
-    rows: Rows = {name: (on_proxy, keys) for name, keys in myopic.items()}
-    rows |= {OWN: (on_proxy, learned), OTHERS: (on_proxy, others)}
+    for name, row in (rows | rows_on_task).items():
+        settings[name] = to_plain(row.config.agents, "agent"), to_plain(row.world.trainings)
     store = Store(config.folder, settings, field="out_dir", free=config.free)
     with store, config.machines.pool() as pool:
         store.once("check", dict)  # settings are compared, whatever `num_agents` is
-        table = _trained(config, rows, store, pool)
+        table = _trained(rows, store, pool)
         null: dict[str, Any] = {}
-        rows = {}
-        if not proxy.env.is_real and task.num_states is None:
-            steps = table.groupby("agent")["train_steps"].mean()
-            lengths = {key: ceil(steps[key]) for key in (*learned, *others)}
-            world, null = _null(config, task, on_proxy.trainings, store)
-            rows[NULL] = _of_lengths(world, lengths), lengths
-        first = [*learned][:1]
-        rows[TASK] = on_task, learned if proxy.env.is_real else first
-        rows[TUNED] = on_task, [tuned]
-        rows[NOTHING] = _of_lengths(on_task, dict.fromkeys(first, 1)), first
-        table = pd.concat([table, _trained(config, rows, store, pool)], ignore_index=True)
-        return _reported(proxy, null, [*learned], table, config.folder)
+        if not proxy.env.is_real and proxy.task.num_states is None:
+            world, null = _null(config, proxy.task, store)
+            rows_on_task = {NULL: _row_on_null(world, rows, table)} | rows_on_task
+        table = pd.concat([table, _trained(rows_on_task, store, pool)], ignore_index=True)
+        return _reported(proxy, null, [*config.agents], table, config.folder)
 
 
 def _judgeable(config: CheckConfig) -> Proxy:
@@ -184,7 +163,70 @@ def _judgeable(config: CheckConfig) -> Proxy:
 # --- who trains where -----------------------------------------------------------------------------
 
 
-def _others(config: CheckConfig, task: Task) -> dict[str, agents.AgentConfig]:
+class Row(NamedTuple):
+    """A row of the table: the configuration of its agents, and the world that they train in."""
+
+    config: CheckConfig
+    world: World
+
+
+def _rows_on_proxy(config: CheckConfig, proxy: Proxy) -> dict[str, Row]:
+    """Myopic agents, the proxy's own ones, and those of other algorithms.
+
+    Raises:
+      ConfigError: if one of them does not fit the task, or would learn nothing.
+    """
+    own: dict[str, Any] = config.agents
+    students: dict[str, Agents] = {}
+    if proxy.env.max_steps > 1:  # in one step a discount has no effect
+        for discount in DISCOUNTS:
+            myopic = {key: dataclasses.replace(x, discount=discount) for key, x in own.items()}
+            students[MYOPIC.format(discount)] = myopic
+    students[OWN] = own
+    if others := _others(config, proxy.task):
+        students[OTHERS] = others
+    rows = {}
+    for name, of_row in students.items():
+        row_config = dataclasses.replace(config, agents=of_row)
+        trainings = fresh_agents.trainings_on(proxy, row_config)
+        rows[name] = Row(row_config, World(proxy.env, proxy.params, proxy.task, trainings))
+    return rows
+
+
+def _rows_on_task(config: CheckConfig, proxy: Proxy) -> dict[str, Row]:
+    """Agents on the real task: those of the proxy, a tuned one, and one that learns nothing."""
+    task = proxy.task
+    first = dict([*config.agents.items()][:1])
+    students = {TASK: config.agents if proxy.env.is_real else first}
+    students |= {TUNED: {"tuned": _tuned(task)}, NOTHING: first}
+    rows = {}
+    for name, of_row in students.items():
+        training = config.real_training if name != NOTHING else _of_length(1, config.real_training)
+        world = World(task.env, task.params, task, dict.fromkeys(of_row, training))
+        rows[name] = Row(dataclasses.replace(config, agents=of_row), world)
+    return rows
+
+
+def _row_on_null(world: World, rows: dict[str, Row], table: pd.DataFrame) -> Row:
+    """The proxy's own agents and the others on a null SE, for their mean steps on the proxy."""
+    steps = table.groupby(["world", "agent"])["train_steps"].mean()
+    students: Agents = {}
+    trainings = {}
+    for name in [name for name in (OWN, OTHERS) if name in rows]:
+        students |= rows[name].config.agents
+        for key, training in rows[name].world.trainings.items():
+            trainings[key] = _of_length(ceil(steps[name, key]), training)
+    config = dataclasses.replace(rows[OWN].config, agents=students)
+    return Row(config, world._replace(trainings=trainings))
+
+
+def _of_length(steps: int, training: TrainingConfig) -> TrainingConfig:
+    """A training of so many steps, with the tests of another one."""
+    tests = training.test_episodes
+    return TrainingConfig(max_steps=steps, max_episodes=steps, test_episodes=tests)
+
+
+def _others(config: CheckConfig, task: Task) -> Agents:
     """Agents of algorithms that the proxy was not learned with.
 
     Raises:
@@ -214,19 +256,8 @@ def _tuned(task: Task) -> agents.AgentConfig:
     return configure("agent", beside.get("agent", {}) | {"name": name} | warmup)
 
 
-def _of_lengths(world: World, lengths: Mapping[str, int]) -> World:
-    """The world with trainings of as many steps, by agent, and with the tests of its own."""
-    trainings = {}
-    for key, steps in lengths.items():
-        tests = world.trainings[key].test_episodes
-        trainings[key] = TrainingConfig(max_steps=steps, max_episodes=steps, test_episodes=tests)
-    return world._replace(trainings=trainings)
-
-
-def _null(
-    config: CheckConfig, task: Task, trainings: dict[str, TrainingConfig], store: Store
-) -> tuple[World, dict[str, Any]]:
-    """A one-step SE made of a cheap policy.
+def _null(config: CheckConfig, task: Task, store: Store) -> tuple[World, dict[str, Any]]:
+    """A one-step SE made of a cheap policy, and where it comes from.
 
     A random search finds the policy. If it does not solve the task, a PPO is trained too, and the
     better policy is taken.
@@ -234,7 +265,6 @@ def _null(
     Args:
       config: of the command.
       task: the real task.
-      trainings: of the agents.
       store: where the search is kept.
     """
     uses = ("search", "test", "record")
@@ -254,14 +284,14 @@ def _null(
             method, lesson = "a PPO", other
     env, weights = make_exact(task, lesson.layers, lesson.states)
     about = {"policy_of": method, "return": lesson.policy_return, "real_steps": int(steps)}
-    return World(env, env.params(weights), task, trainings), about
+    return World(env, env.params(weights), task, {}), about
 
 
-def _trained(config: CheckConfig, rows: Rows, store: Store, pool: Pool) -> pd.DataFrame:
+def _trained(rows: dict[str, Row], store: Store, pool: Pool) -> pd.DataFrame:
     """A line for each agent. Missing results are computed, a row at a time, and stored."""
     tables = []
-    for row, (world, keys) in rows.items():
-        names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in keys}
+    for row, (config, world) in rows.items():
+        names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in config.agents}
         entries = {key: store.get(name) for key, name in names.items()}
         results = {key: entry[0] for key, entry in entries.items() if entry is not None}
         missing = [key for key in names if key not in results]
@@ -322,7 +352,7 @@ def _judgements(table: pd.DataFrame, learned: list[str], proxy: Proxy) -> dict[s
     judgements = {}
     for key in learned:
         floor = scores[TASK, key] if is_rn else scores[NOTHING, learned[0]].mean()
-        myopic = scores.get((MYOPIC.format(0), f"{key}-0"), scores[OWN, key])
+        myopic = scores.get((MYOPIC.format(0), key), scores[OWN, key])
         judgements[key] = judge(myopic, scores[OWN, key], floor, top)
     return judgements
 

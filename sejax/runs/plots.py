@@ -59,7 +59,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
     """
     rng = np.random.default_rng(0)
     rows = list(table["world"].unique())
-    algorithms = list(dict.fromkeys(name.partition("-")[0] for name in table["agent"]))
+    agents = list(table["agent"].unique())
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8, 1.5 + 0.8 * len(rows)))
         axis = figure.subplots()
@@ -68,7 +68,7 @@ def check(table: Any, solved_reward: float, path: Path, title: str) -> None:
             for i, (name, returns) in enumerate(parts):
                 level = y + (i + 0.5) / len(parts) * 0.8 - 0.4
                 spread = level + rng.uniform(-0.25, 0.25, len(returns)) / len(parts)
-                color = f"C{algorithms.index(name.partition('-')[0])}"
+                color = f"C{agents.index(name)}"
                 axis.plot(returns, spread, "o", ms=3, color=color, alpha=0.5, mew=0)
                 axis.plot(returns.mean(), level, "|", ms=26 / len(parts), mew=2.5, color=color)
                 axis.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), fontsize=7)
