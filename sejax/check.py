@@ -222,8 +222,7 @@ def _row_on_null(world: World, rows: dict[str, Row], table: pd.DataFrame) -> Row
 
 def _of_length(steps: int, training: TrainingConfig) -> TrainingConfig:
     """A training of so many steps, with the tests of another one."""
-    tests = training.test_episodes
-    return TrainingConfig(max_steps=steps, max_episodes=steps, test_episodes=tests)
+    return TrainingConfig(max_steps=steps, max_episodes=steps, test_episodes=training.test_episodes)
 
 
 def _others(config: CheckConfig, task: Task) -> Agents:

@@ -30,7 +30,9 @@ from sejax.options.plain import flatten, merge, split, unquoted, with_home
 
 Tree: TypeAlias = dict[str, Any]  # nested plain values
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
-CHOOSE_ALL = {"agent", "agent.name", "agents"}  # words that choose all agents
+# A choice may stand beside its fields, as in config.yaml.
+CHOICES = {f"{group}.name": group for group in registry.GROUPS}
+CHOOSE_ALL = {"agent", "agents"}  # words that choose all agents
 # `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
 BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
 # What reading a file of YAML may raise.
@@ -63,7 +65,7 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
         use = shortened(f"{text.rstrip(',')}]" if is_open else first)
         rule = "must be one value; a list stands in brackets, without spaces"
         require(not (others or is_open), name, rule, got=text, use=use)
-        texts[name] = text
+        texts[CHOICES.get(name, name)] = text
     return texts
 
 
@@ -87,7 +89,8 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     path = Path(with_home(texts.pop("preset")))
     typed = _tree(texts, groups)
     try:
-        file = _tree(flatten(yaml.safe_load(path.read_text(encoding="utf-8"))), groups)
+        values = flatten(yaml.safe_load(path.read_text(encoding="utf-8")))
+        file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         drop_other_choices(file, typed, groups)
         return drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed
     except ConfigError:  # it is readable
