@@ -137,8 +137,8 @@ class Bilevel:
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
-        The strategy compares other numbers (`Scoring.compared`) than are kept and shown
-        (`Scoring.reported`). After a run is over nothing changes: each new leaf is dropped.
+        The strategy compares other numbers (`Scoring.search_scores`) than are kept and shown
+        (`Scoring.shown_scores`). After a run is over nothing changes: each new leaf is dropped.
 
         Of equally good incumbents it keeps the last. Reason: once incumbents reach the task's
         highest return, the search still moves to weights that also teach when perturbed.
@@ -146,15 +146,15 @@ class Bilevel:
         # XLA must not fuse the sums below into the program of the outcome: they would round
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
-        compared, mean_score = self.scoring.compared(outcome)
+        scores, mean_score = self.scoring.search_scores(outcome)
         es_state = self.layout.strategy.tell(
-            candidates.key_tell, candidates.population, compared, mean_score, candidates.es_state
+            candidates.key_tell, candidates.population, scores, mean_score, candidates.es_state
         )
-        scores = self.scoring.reported(outcome)
+        shown = self.scoring.shown_scores(outcome)
         measured = ScoredProxy(
             weights=candidates.incumbent,
-            score=or_minus_inf(scores.incumbent_mean),
-            by_agent=or_minus_inf(scores.agent_means),
+            score=or_minus_inf(shown.incumbent_mean),
+            by_agent=or_minus_inf(shown.agent_means),
             generation=state.generation,
         )
         is_best = (measured.score >= state.best.score) & jnp.isfinite(measured.score)
@@ -167,7 +167,7 @@ class Bilevel:
         )
         after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
         active = ~state.solved
-        return after, self.scoring.info(scores, outcome, state.generation, after.best.score, active)
+        return after, self.scoring.info(shown, outcome, state.generation, after.best.score, active)
 
 
 def make_learner(
@@ -251,9 +251,9 @@ def make_bilevel(
     require(proxy.task is task, "proxy", "must be of the given task object. Set task=proxy.task.")
     objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
-    mean, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
-    strategy = make("es", es, mean.size)
-    _require_population(strategy, mean)
+    example, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
+    strategy = make("es", es, example.size)
+    _require_population(strategy, example)
     layout = Layout(strategy=strategy, mixture=Mixture.of(agent))
     bilevel = Bilevel(
         proxy=proxy,
@@ -270,14 +270,14 @@ def make_bilevel(
     return bilevel
 
 
-def _require_population(strategy: Strategy, mean: Float[Array, " dims"]) -> None:
+def _require_population(strategy: Strategy, example: Float[Array, " dims"]) -> None:
     """Checks that a strategy, which may be the user's own, asks for the population that it says."""
 
     def population(key: Array) -> Array:
-        return strategy.ask(key, strategy.init(key, mean))[0]
+        return strategy.ask(key, strategy.init(key, example))[0]
 
     shape = jax.eval_shape(population, jax.random.key(0)).shape
-    expected = (strategy.num_candidates, mean.size)
+    expected = (strategy.num_candidates, example.size)
     require(shape == expected, "es", f"must ask for candidates {expected}", got=shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
     require(least > 0, "es", "must have num_evals and num_incumbent_evals of 1 or more", got=least)

@@ -28,7 +28,7 @@ from sejax.ops.parallel import compiler_options, in_batches_on_cpu, spread_over_
 from sejax.options import LARGEST, require
 from sejax.options.registry import require_part
 from sejax.proxies.base import ProxyEnv, is_real
-from sejax.training import TrainingConfig, TrainResult, make_trainer, num_parallel_on_cpu
+from sejax.training import TrainingConfig, TrainResult, cpu_num_parallel_of, make_trainer
 
 # --- greedy episodes ------------------------------------------------------------------------------
 
@@ -279,7 +279,7 @@ def make_evaluator(
 
     run = agent.fresh(make_run)
     if in_batches:
-        run = in_batches_on_cpu(run, num_parallel_on_cpu(agent, training))
+        run = in_batches_on_cpu(run, cpu_num_parallel_of(agent, training))
     return lambda key, env_params, active=True, test_params=None: run(
         key, env_params, jnp.asarray(active), test_params
     )
@@ -383,7 +383,7 @@ def _evaluation_program(
     evaluate = make_evaluator(agent, env, task, training, in_batches=False)
 
     def program(keys: Array, env_params: PyTree) -> PyTree:
-        width = num_parallel_on_cpu(agent, training, keys.shape[0])
+        width = cpu_num_parallel_of(agent, training, keys.shape[0])
         train = functools.partial(evaluate, env_params=env_params)
         spread = spread_over_devices(
             train, num_devices=devices, num_parallel=num_parallel, cpu_num_parallel=width

@@ -20,7 +20,7 @@ from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import Objective, Outcome
 from sejax.ops.parallel import spread_groups_over_devices
 from sejax.proxies.base import ProxyEnv
-from sejax.training import TrainingConfig, num_parallel_on_cpu
+from sejax.training import TrainingConfig, cpu_num_parallel_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ class Layout:
 
 
 class Candidates(struct.PyTreeNode):
-    """What a generation evaluates, and what `Strategy.tell` needs beside the scores."""
+    """What `Bilevel.ask` gives: what a generation evaluates, and what `Strategy.tell` needs."""
 
     population: Float[Array, "pop dims"]
     incumbent: Float[Array, " dims"]
@@ -133,7 +133,7 @@ class GenerationEvaluator:
     Attributes:
       devices: as given.
       evaluators: for each agent, `(training) -> Outcome`, for one of its `Trainings`.
-      widths: for each agent, the trainings in a vmapped batch on a CPU core; None for all.
+      cpu_num_parallel: for each agent, the trainings in a vmapped batch of a CPU core; None: all.
       num_trainings: the number of trainings in a generation, with all agents.
 
     Raises:
@@ -167,11 +167,12 @@ class GenerationEvaluator:
             return evaluate_one
 
         self.evaluators = [evaluator_of(agent) for agent in agents]
-        self.widths = [num_parallel_on_cpu(agent, training) for agent in agents]
+        # Not by the number of trainings: a population of any size gives the same bits.
+        self.cpu_num_parallel = [cpu_num_parallel_of(agent, training) for agent in agents]
         self.num_trainings = layout.num_on_candidates + layout.num_on_incumbent
         self._layout = layout
         self._spread = spread_groups_over_devices(
-            self.evaluators, self.widths, num_devices=devices, num_parallel=num_parallel
+            self.evaluators, self.cpu_num_parallel, num_devices=devices, num_parallel=num_parallel
         )
 
     def __call__(self, candidates: Candidates) -> Outcome:

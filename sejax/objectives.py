@@ -75,7 +75,7 @@ class Objective:
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def compared(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def search_scores(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that compare candidates; nan for diverged agents.
 
         Raises:
@@ -83,7 +83,7 @@ class Objective:
         """
         return _checked(self.score(outcome), outcome.nonfinite)
 
-    def reported(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def shown_scores(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan for diverged agents.
 
         Raises:

@@ -48,7 +48,7 @@ class AgentInfo(struct.PyTreeNode):
 class GenerationInfo(struct.PyTreeNode):
     """Statistics of a generation: a row of `metrics.csv`, and what it is made of.
 
-    Scores are those that people see (`Objective.reported`). Those of the population leave out
+    Scores are those that people see (`Objective.shown_scores`). Those of the population leave out
     agents that diverged; among the incumbent's such agents rank last. Where `active` is False
     nothing was trained: the other numbers are of trainings without a step, and mean nothing.
     """
@@ -82,22 +82,24 @@ class Scoring:
     objective: Objective
     layout: Layout
 
-    def compared(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+    def search_scores(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
+
+        The scores of a candidate's evaluations become one score here.
 
         Args:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
         """
         layout = self.layout
-        scores = self._scores(self.objective.compared(outcome))
+        scores = self._scores(self.objective.search_scores(outcome))
         aggregate = jnp.mean if layout.strategy.eval_aggregate == "mean" else jnp.min
         by_candidate = scores.population.reshape(-1, layout.strategy.num_evals)
         population = aggregate(by_candidate, axis=1)  # nan if the agent of one evaluation diverged
         return layout.mixture.comparable(population, layout.candidates_of, scores.agent_means)
 
-    def reported(self, outcome: Outcome) -> Scores:
+    def shown_scores(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
-        return self._scores(self.objective.reported(outcome))
+        return self._scores(self.objective.shown_scores(outcome))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
@@ -105,7 +107,7 @@ class Scoring:
         """The statistics of a generation.
 
         Args:
-          scores: as `reported` of the outcome.
+          scores: `shown_scores` of the outcome.
           outcome: of all trainings.
           generation: its number.
           best: score of the best incumbent so far, with this one.

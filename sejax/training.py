@@ -244,13 +244,13 @@ def make_trainer(
     env = repeat_actions(env, agent.spec.action_repeat)
     train = _Loop(agent, env, training, solved_reward, test_fn, keeps_stored).train
     if in_batches:
-        train = in_batches_on_cpu(train, num_parallel_on_cpu(agent, training))
+        train = in_batches_on_cpu(train, cpu_num_parallel_of(agent, training))
     return lambda key, env_params, hparams=None, active=True: train(
         key, env_params, agent.hparams if hparams is None else hparams, jnp.asarray(active)
     )
 
 
-def num_parallel_on_cpu(
+def cpu_num_parallel_of(
     agent: Agent, training: TrainingConfig, num_agents: int = LARGEST
 ) -> int | None:
     """Agents in a vmapped batch of a CPU core; None for all, as with tabular agents.
@@ -262,7 +262,7 @@ def num_parallel_on_cpu(
         return None
     if not training.is_fixed_length:
         return 1
-    return min(width, cpu.width_of(num_agents))
+    return min(width, cpu.balanced_num_parallel(num_agents))
 
 
 @dataclass(frozen=True)
@@ -369,6 +369,9 @@ class _Loop:
         self, buffer: Buffer, large: PyTree, state: _LoopState, consts: _Consts, masked: bool
     ) -> tuple[PyTree, _LoopState]:
         """Fills the buffer and learns from it. A training that ends before learns nothing.
+
+        With `learns_every=3` an iteration is step, step, step, learn. Each `step` is masked, since
+        the training may end at the first or second one.
 
         An iteration of the loop, with the arguments of `step`: it replaces `learns_every` of them.
         """

@@ -37,8 +37,8 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
     np.testing.assert_array_equal(long.test_params(generations[:3]).scored_steps, [1000, 900, 800])
     # Members are worth the part that is scored, incumbents whole episodes.
     ended = outcome([10.0, 200.0, -3.0], [1, 2, 3], [False, False, True])
-    np.testing.assert_array_equal(objective.compared(ended), [20.0, 400.0, np.nan])
-    np.testing.assert_array_equal(objective.reported(ended), [10.0, 200.0, np.nan])
+    np.testing.assert_array_equal(objective.search_scores(ended), [20.0, 400.0, np.nan])
+    np.testing.assert_array_equal(objective.shown_scores(ended), [10.0, 200.0, np.nan])
     assert MaxReward().make(task()).test_params(0) is None
 
 
@@ -51,7 +51,7 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
 ])  # fmt: skip
 def test_scores_are_worked_by_hand(config, scores):
     objective = config.make(task(195.0))
-    got = objective.compared(outcome([190.0, 195.0, 200.0], [500, 500, 400], [False] * 3))
+    got = objective.search_scores(outcome([190.0, 195.0, 200.0], [500, 500, 400], [False] * 3))
     np.testing.assert_array_equal(got, scores)
 
 
@@ -64,15 +64,16 @@ CONFIGS = [configure("objective", {"name": name}) for name in NAMES]
     "objective", [OWN, *(config.make(task()) for config in CONFIGS)], ids=["own", *NAMES]
 )
 def test_a_training_that_diverged_has_no_score(objective):
-    scores = objective.compared(outcome([200.0, 200.0], [10, 10], [True, False]))
+    scores = objective.search_scores(outcome([200.0, 200.0], [10, 10], [True, False]))
     assert np.isnan(scores[0]) and np.isfinite(scores[1])
 
 
 def test_a_score_that_statistics_cannot_hold_counts_as_diverged():
     ended = outcome([np.inf, -np.inf, -3e38, 9e29], [1] * 4, [False] * 4)
-    assert np.isnan(MaxReward().make(task()).compared(ended)).tolist() == [True, True, True, False]
+    scores = MaxReward().make(task()).search_scores(ended)
+    assert np.isnan(scores).tolist() == [True, True, True, False]
 
 
 def test_an_objective_must_score_each_agent():
     mean_of_all = Objective(score=lambda outcome: outcome.test_returns.mean())
-    assert refused(mean_of_all.compared, outcome([1.0, 2.0], [10] * 2, [False] * 2)) == "objective"
+    assert refused(mean_of_all.search_scores, outcome([1.0, 2.0], [10] * 2, [False] * 2)) == "objective"

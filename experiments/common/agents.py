@@ -22,7 +22,7 @@ from sejax.agents import NoExploration
 from sejax.agents.varied import for_keys
 from sejax.ops.parallel import spread_over_devices
 from sejax.options.plain import configure, to_plain
-from sejax.training import num_parallel_on_cpu
+from sejax.training import cpu_num_parallel_of
 
 # Kinds of students, where actions are discrete and where they are continuous.
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -219,7 +219,7 @@ def make_program(
             return run(key, mine, active), agent.drawn_values(key)
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
-        num_parallel = num_parallel_on_cpu(agent, training)
+        num_parallel = cpu_num_parallel_of(agent, training)
         spread = spread_over_devices(one, num_devices=devices, cpu_num_parallel=num_parallel)
         return spread(keys, jax.numpy.asarray(groups), active)
 

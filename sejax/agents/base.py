@@ -1,4 +1,20 @@
-"""The contract of an agent: a bundle of pure functions over one agent's state."""
+"""The contract of an agent: a bundle of pure functions over one agent's state.
+
+From a configuration to a training:
+
+================= ==================================================================================
+`AgentConfig`     the options of an algorithm, such as `DDQNConfig`; its `make(task)` builds the
+                  `Algorithm`, and returns `Algorithm.agent()`. `AgentOptions` are those that all of
+                  sejax's algorithms with warm-up share
+`Algorithm`       an algorithm's methods for a task's sizes, such as `DDQN`
+`Agent`           these methods as plain functions, with the `AgentSpec`: what a training loop must
+                  know, such as when learning begins
+`make_agent`      checks that configuration and task fit, calls `make`, adds an exploration bonus,
+                  and returns the same object for equal arguments
+`Hparams`         the numbers of the options that may vary between agents of one program; the
+                  agent's state holds them
+================= ==================================================================================
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable

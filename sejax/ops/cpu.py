@@ -25,14 +25,14 @@ MIN_BLOCK = 32
 NUM_SIZES, NUM_SIZES_DEEP = 6, 12
 
 
-def width_of(num_agents: int) -> int:
+def balanced_num_parallel(num_agents: int) -> int:
     """The width of a batch: the largest power of two with which the agents fill two batches, or 1.
 
     Two batches keep two devices busy. The last batch is filled up with copies: with a width of 16,
     eight agents would take the time of sixteen.
 
     Example:
-      >>> [width_of(num_agents) for num_agents in (1, 4, 8, 20)]
+      >>> [balanced_num_parallel(num_agents) for num_agents in (1, 4, 8, 20)]
       [1, 2, 4, 8]
     """
     return 1 << max(0, (num_agents // 2).bit_length() - 1)

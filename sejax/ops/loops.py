@@ -75,7 +75,8 @@ def _while_any_active(
 
     So jax never sees a `while_loop` with a batched predicate: `loop` is opaque to `vmap`, and its
     rule writes the vmaps into the loop's body instead. `large`, `small` and `consts` have `depth`
-    leading axes, all of them the batch's. At depth 0 nothing is masked.
+    leading axes, all of them the batch's. At depth 0 nothing is masked. A state `[n]` is `[8, n]`
+    at depth 1, under `vmap` over 8 agents, and `[4, 8, n]` at depth 2, under one more over 4 keys.
     """
 
     def batch_step(large: PyTree, small: PyTree, consts: PyTree) -> tuple[PyTree, PyTree]:

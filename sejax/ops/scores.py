@@ -5,8 +5,9 @@ What an agent that diverged counts as, step by step:
 ================================== ================================================================
 step                               its score
 ================================== ================================================================
-`Objective.compared`, `reported`   nan
-`Scoring.compared`                 nan for its candidate
+`Objective.search_scores`,         nan
+`Objective.shown_scores`
+`Scoring.search_scores`            nan for its candidate
 `scoring.with_diverged_last`       on the incumbent: the lowest one of its algorithm in the
                                    generation; nan if all trainings with the algorithm diverged
 `Mixture.comparable`               stays nan

@@ -139,7 +139,7 @@ class LearnConfig(CommandConfig):
         mixture = Mixture(
             agents=learners,
             names=tuple(self.agents),
-            weights=tuple(self.mixture.weights.values()),
+            weights=tuple(self.mixture.weights.values()),  # `__post_init__` gave them this order
             aggregate=self.mixture.aggregate,
         )
         return {

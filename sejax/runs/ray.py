@@ -106,7 +106,7 @@ def share_sizes(bilevel: Bilevel, num_parallel: int | None) -> list[int]:
     It does not depend on the number of workers, because sums over batches of other widths round
     otherwise.
     """
-    return [num_parallel or width or BATCH for width in bilevel.evaluate.widths]
+    return [num_parallel or width or BATCH for width in bilevel.evaluate.cpu_num_parallel]
 
 
 class RemoteChunks(Chunks):
