@@ -75,5 +75,5 @@ def test_a_score_that_statistics_cannot_hold_counts_as_diverged():
 
 
 def test_an_objective_must_score_each_agent():
-    mean_of_all = Objective(score=lambda outcome: outcome.test_returns.mean())
-    assert refused(mean_of_all.search_scores, outcome([1.0, 2.0], [10] * 2, [False] * 2)) == "objective"
+    mean = Objective(score=lambda outcome: outcome.test_returns.mean())  # of all agents
+    assert refused(mean.search_scores, outcome([1.0, 2.0], [10] * 2, [False] * 2)) == "objective"
