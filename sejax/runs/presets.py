@@ -59,6 +59,11 @@ def preset_of(typed: Tree) -> Tree:
 
     Raises:
       ConfigError: for an unknown proxy or preset, or a preset that the task does not have.
+
+    Example:
+      >>> settings = preset_of({"agents": {"mine": {"name": "ddqn"}}, "preset": "paper"})
+      >>> settings["generations"], settings["agents"]["mine"]["batch_size"]
+      (200, 199)
     """
     name = str(typed.get("preset", "best"))
     env, proxy, es = (chosen(typed, group) for group in ("env", "proxy", "es"))
@@ -77,4 +82,5 @@ def preset_of(typed: Tree) -> Tree:
         {"objective": {"name": objective}, "preset": name},
         {"agents": {key: x.get("agent", {}) for key, x in beside.items()}},
     )
+    # The fields of an only agent, which stand under its key too.
     return {key: x for key, x in settings.items() if key != "agent"}
