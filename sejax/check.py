@@ -291,15 +291,12 @@ def _trained(rows: dict[str, Row], store: Store, pool: Pool) -> pd.DataFrame:
     tables = []
     for row, (config, world) in rows.items():
         names = {key: f"{as_file_name(row)}/{key}-{config.num_agents}" for key in config.agents}
-        entries = {key: store.get(name) for key, name in names.items()}
-        results = {key: entry[0] for key, entry in entries.items() if entry is not None}
-        missing = [key for key in names if key not in results]
+        missing = [key for key, name in names.items() if store.get(name) is None]
         print(f"training on {row}: {', '.join(missing) or 'done'} ...", flush=True)
-        jobs = [(config, world, key) for key in missing]
-        for key, columns in zip(missing, pool(fresh_agents.train, jobs), strict=True):
-            store.put(names[key], columns)
-            results[key] = columns
-        tables += [pd.DataFrame({"world": row, "agent": x, **results[x]}) for x in names]
+        computed = iter(pool(fresh_agents.train, [(config, world, key) for key in missing]))
+        for key, name in names.items():
+            columns = store.once(name, functools.partial(next, computed))
+            tables.append(pd.DataFrame({"world": row, "agent": key, **columns}))
     return pd.concat(tables, ignore_index=True)
 
 
