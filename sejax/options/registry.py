@@ -165,6 +165,8 @@ def find(group: str, name: str) -> Any:
       ConfigError: for an unknown name, a module that cannot be imported, or an attribute that is
         no plugin.
     """
+    if name in BUILT_IN[group]:
+        return resolve_name(BUILT_IN[group][name])
     path = _path_of(group, name)
     if path is None and ":" not in name:
         raise unknown_name(group, name, [*names(group), *_suggestions(name)])
