@@ -149,9 +149,9 @@ def distill(config: DistillConfig, words: str = "") -> Path:
     """
     with Store(config.folder, config.plain(), free=config.free) as store:
         if store.get(BEGUN) is None:  # it raises for other settings
-            found = [name for name in ("proxy", "checkpoint") if store.file(name).exists()]
-            rule = f"must hold no {' or '.join(found)} of another command"
-            require(not found, "run_dir", rule, got=store.folder, use="FOLDER")
+            others = [name for name in ("proxy", "checkpoint") if store.file(name).exists()]
+            rule = f"must hold no {' or '.join(others)} of another command"
+            require(not others, "run_dir", rule, got=store.folder, use="FOLDER")
         return _distilled(config, store, words)
 
 

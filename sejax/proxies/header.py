@@ -164,12 +164,13 @@ def find(source: str | Path, option: str = "source") -> Path:
     file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path
     if os.path.isfile(file):
         return Path(file)
-    if name in pretrained_files():
-        return pretrained_files()[name]
+    shipped = pretrained_files()
+    if name in shipped:
+        return shipped[name]
     if os.path.isdir(path) or "." in path or os.path.basename(path) != path:
         rule = f"must be a file, a run's folder with its {hub.FILE}, a name or hf://USER/REPO"
         raise ConfigError(option, f"{rule}; got {shortened(name)}, where there is none.")
-    raise unknown_name(option, name, pretrained_files())
+    raise unknown_name(option, name, shipped)
 
 
 # --- reading and writing --------------------------------------------------------------------------
