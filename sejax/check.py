@@ -138,7 +138,7 @@ def findings(config: CheckConfig) -> dict[str, Any]:
         store.once("check", dict)  # settings are compared, whatever `num_agents` is
         table = _trained(rows, store, pool)
         null: dict[str, Any] = {}
-        if not proxy.env.is_real and proxy.task.num_states is None:
+        if not proxy.env.has_real_dynamics and proxy.task.num_states is None:
             world, null = _null(config, proxy.task, store)
             rows_on_task = {NULL: _row_on_null(world, rows, table)} | rows_on_task
         table = pd.concat([table, _trained(rows_on_task, store, pool)], ignore_index=True)
@@ -150,7 +150,7 @@ def _judgeable(config: CheckConfig) -> Proxy:
     require(config.proxy != "real", "proxy", "must be a learned one; got real. Set proxy=RUN_DIR.")
     proxy = fresh_agents.loaded(config)
     task = proxy.task
-    is_idle = proxy.env.is_real and config.training_from != "proxy"
+    is_idle = proxy.env.has_real_dynamics and config.training_from != "proxy"
     require(not is_idle, "training_from", "must be left out for an RN. Set real_training.*.")
     jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)  # raises if it cannot run
     require(task.is_solvable, "env", f"must have a solved score; got {task.name}, which has none.")
@@ -197,7 +197,7 @@ def _rows_on_task(config: CheckConfig, proxy: Proxy) -> dict[str, Row]:
     """Agents on the real task: those of the proxy, a tuned one, and one that learns nothing."""
     task = proxy.task
     first = dict([*config.agents.items()][:1])
-    students = {TASK: config.agents if proxy.env.is_real else first}
+    students = {TASK: config.agents if proxy.env.has_real_dynamics else first}
     students |= {TUNED: {"tuned": _tuned(task)}, NOTHING: first}
     rows = {}
     for name, of_row in students.items():
@@ -312,7 +312,7 @@ def _reported(
     summary = fresh_agents.summarise(table, ["world"])
     judgements = _judgements(table, learned, proxy)
     # The dynamics of an RN are the task's.
-    teaches = "its reward teaches" if proxy.env.is_real else "its dynamics teach"
+    teaches = "its reward teaches" if proxy.env.has_real_dynamics else "its dynamics teach"
     verdict = verdict_of(judgements.values(), teaches)
     report = {"null_se": null, "cost": _cost(proxy, summary), "verdict": verdict}
     title = f"{proxy.path.stem}: return on {task.name}; % that solve it ({task.solved_reward:g})"
@@ -334,7 +334,7 @@ def _scored(table: pd.DataFrame, proxy: Proxy) -> pd.DataFrame:
     is_lost = table["nonfinite"] > 0
     returns = diverged_last(table["test_return"].mask(is_lost))
     steps = table["train_steps"].mask(is_lost, table["train_steps"].max())
-    score = -steps if proxy.env.is_real else returns
+    score = -steps if proxy.env.has_real_dynamics else returns
     solved = reaches(returns, proxy.task.solved_reward)
     return table.assign(test_return=returns, train_steps=steps, score=score, solved=solved)
 
@@ -343,7 +343,7 @@ def _judgements(table: pd.DataFrame, learned: list[str], proxy: Proxy) -> dict[s
     """The myopia test of each algorithm that the proxy was learned with."""
     by_agent = table.groupby(["world", "agent"], sort=False)["score"]
     scores = {name: score.to_numpy() for name, score in by_agent}
-    is_rn = proxy.env.is_real
+    is_rn = proxy.env.has_real_dynamics
     top = 0.0 if is_rn else float(proxy.task.solved_reward)
     judgements = {}
     for key in learned:
@@ -365,7 +365,7 @@ def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
     cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
     if "real_steps" in cost:
         steps, returns = summary["train_steps_mean"], summary["test_return_mean"]
-        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if proxy.env.is_real else 0)
+        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if proxy.env.has_real_dynamics else 0)
         pays = saved > 0 and reaches(returns[OWN], float(proxy.task.solved_reward))
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if pays else "never"
     return cost

@@ -27,7 +27,7 @@ from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import compiler_options, in_batches_on_cpu, spread_over_devices
 from sejax.options import LARGEST, require
 from sejax.options.registry import require_part
-from sejax.proxies.base import ProxyEnv, is_real
+from sejax.proxies.base import ProxyEnv, steps_are_real
 from sejax.training import TrainingConfig, TrainResult, cpu_num_parallel_of, make_trainer
 
 # --- greedy episodes ------------------------------------------------------------------------------
@@ -272,7 +272,7 @@ def make_evaluator(
                 train_episodes=result.episodes,
                 auc=area_under_curve(result, tests.returns.mean()),
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
+                real_steps=real_steps + result.train_steps if steps_are_real(env) else real_steps,
             )
 
         return run

@@ -28,7 +28,7 @@ from sejax.ops.parallel import in_batches_on_cpu
 from sejax.ops.scores import reaches
 from sejax.options import LARGEST, Count, NonNegative, Options, WholeNumber, require
 from sejax.options.registry import require_part
-from sejax.proxies.base import is_real, proxy_in
+from sejax.proxies.base import proxy_in, steps_are_real
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,7 +296,7 @@ class _Loop:
     @property
     def limit_is_terminal(self) -> bool:
         """Whether targets do not bootstrap at a time limit."""
-        return self.training.time_limit_is_terminal and is_real(self.env)
+        return self.training.time_limit_is_terminal and steps_are_real(self.env)
 
     def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
         """One training."""

@@ -17,7 +17,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.envs.wrappers import Wrapper
 from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.options import registry
-from sejax.proxies.base import is_real, proxy_in
+from sejax.proxies.base import proxy_in, steps_are_real
 from sejax.proxies.reward import RewardConfig, RewardEnv
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
@@ -199,8 +199,8 @@ def test_prepared_params_look_up_what_the_network_says():
         for one in (params, prepared):
             np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
     assert prepared.discount == np.float32(GAMMA)
-    assert is_real(env) and env.max_steps == 50 and proxy_in(Wrapper(env)) is env
-    assert is_real(env.task.env)
+    assert steps_are_real(env) and env.max_steps == 50 and proxy_in(Wrapper(env)) is env
+    assert steps_are_real(env.task.env)
     assert make_env("cartpole").prepare(params, GAMMA).potentials is None
 
 

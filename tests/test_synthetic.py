@@ -13,7 +13,7 @@ from sejax import envs
 from sejax.envs.wrappers import Wrapper
 from sejax.options import registry
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.base import is_real
+from sejax.proxies.base import steps_are_real
 from sejax.proxies.synthetic import SyntheticConfig, SyntheticState
 
 CONFIG = paper_se(hidden_size=5, num_layers=2, activation="leaky_relu")
@@ -268,7 +268,7 @@ def test_horizons_and_least_numbers_of_steps(config, outputs, terminated, trunca
     np.testing.assert_array_equal(walked[1], truncated)  # as in sejax.gym
     np.testing.assert_allclose(walked[2], discounts)
     limit = config.get("horizon", 200)
-    assert not is_real(env) and env.max_steps == limit
+    assert not steps_are_real(env) and env.max_steps == limit
     assert env.default_params.max_steps_in_episode == limit
 
 
@@ -322,8 +322,8 @@ def test_plain_gymnax_usage_counts_time_truncates_at_the_limit_and_resets():
 def test_spaces_and_names_are_those_of_the_task():
     env = make_env("acrobot")
     assert env.num_actions == 3 and env.observation_space().shape == (6,)
-    assert env.name == "Synthetic-acrobot" and not is_real(env) and env.max_steps == 500
-    assert not is_real(Wrapper(env)) and is_real(Wrapper(env.task.env))
+    assert env.name == "Synthetic-acrobot" and not steps_are_real(env) and env.max_steps == 500
+    assert not steps_are_real(Wrapper(env)) and steps_are_real(Wrapper(env.task.env))
     assert make_env("acrobot") is env  # one instance for each configuration
 
 

@@ -109,7 +109,7 @@ class Study:
 
     def agents(self) -> Iterator[pd.DataFrame]:
         """A row for each agent; the last ones are tuned ones on the real task."""
-        proxy, is_rn = self.proxy, self.proxy.env.is_real
+        proxy, is_rn = self.proxy, self.proxy.env.has_real_dynamics
         if is_rn:
             more = {"exploration": proxy.learned_with("exploration")}
             training = self.until_solved(sejax.training_of(proxy).time_limit_is_terminal)

@@ -1,8 +1,8 @@
 """The contract of a proxy: an environment with weights that stands in for a real task.
 
 A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent trains in
-it as in any other environment. The inner loop also needs `ProxyEnv.is_real`, `ProxyEnv.max_steps`
-and `ProxyEnv.prepare`.
+it as in any other environment. The inner loop also needs `ProxyEnv.has_real_dynamics`,
+`ProxyEnv.max_steps` and `ProxyEnv.prepare`.
 """
 
 import copy
@@ -142,7 +142,7 @@ class ProxyEnv(Environment, ABC):
         return params
 
     @property
-    def is_real(self) -> bool:
+    def has_real_dynamics(self) -> bool:
         """Whether its dynamics are the real task's."""
         return self.config.has_real_dynamics
 
@@ -180,6 +180,6 @@ def proxy_in(env: Environment) -> ProxyEnv | None:
     return env if isinstance(env, ProxyEnv) else None
 
 
-def is_real(env: Environment) -> bool:
+def steps_are_real(env: Environment) -> bool:
     """Whether steps in an environment are steps of a real task."""
-    return (proxy := proxy_in(env)) is None or proxy.is_real
+    return (proxy := proxy_in(env)) is None or proxy.has_real_dynamics

@@ -204,7 +204,7 @@ def trainings_on(proxy: Proxy, config: FreshAgentsConfig) -> dict[str, TrainingC
 
 def _training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingConfig:
     group, training = "training", config.training
-    if config.training_from == "proxy" and proxy.env.is_real:
+    if config.training_from == "proxy" and proxy.env.has_real_dynamics:
         group, training = "real_training", config.real_training
     elif config.training_from == "proxy":
         use = "config training.max_steps=2000 training.max_episodes=2000"
