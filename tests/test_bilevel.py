@@ -257,7 +257,6 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     types = [[(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(x)] for x in (state, after)]
     assert types[0] == types[1]
     strategy = program.layout.strategy
-    num_population = strategy.num_candidates * strategy.num_evals
-    assert info.population_scores.shape == (num_population,)
+    assert info.population_scores.shape == (strategy.num_candidates * strategy.num_evals,)
     assert info.train_steps.shape == info.real_steps.shape == (program.evaluate.num_trainings,)
     assert info.incumbent_mean.shape == ()

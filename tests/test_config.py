@@ -218,7 +218,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agents=[ddqn,td3_discret]", "agents.td3_discret", "td3_discrete"),
     ("agents=[ddqn,ppo] agent.clip_ratio=1", "agents.ddqn.clip_ratio", "of agent=ppo."),
     ("agents=[ddqn,ppo] agents.ppo.tau=1", "agents.ppo.tau", "of ppo, but of agent=ddqn, "),
-    ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo]."),
+    ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac] alone."),
     ("agents=[ddqn,ppo] agents.ppo.epoch=3", "agents.ppo.epoch", "agents.ppo.epochs?"),
     ("mixture.aggregate=min", "mixture", "agents=[ddqn,ppo]"), ("es.loss=squared", "es.loss", ""),
     ("preset=paper env=mountain_car", "preset", "preset=best"),

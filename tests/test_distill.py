@@ -142,7 +142,7 @@ def test_an_agent_is_trained_once_and_its_steps_are_counted(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("word", [
     *("num_snapshots=0", "search.num_top=5", "search.generationz=5", "agent=nothing"),
-    *("generations=5", "proxy.hidden_size=5"),
+    *("generations=5", "proxy.hidden_size=5", "training.max_steps=0"),
     *("policy=sax", "policy=nothing:act", "policy=td3"),
     *(f"policy={__name__}:{x}" for x in ("SIGN", "of_another_shape", "out_of_range", "fails")),
 ])  # fmt: skip
@@ -193,8 +193,9 @@ def test_defaults_are_those_of_the_task():
     assert config.search.alive_bonus == 1.0 and config.training.max_steps == 10_000
     assert DistillConfig.of_words(["env=hopper", "search.alive_bonus=0"]).search.alive_bonus == 0.0
     assert DistillConfig.of_words(["env=halfcheetah"]).search.alive_bonus == 0.0
-    config = DistillConfig.of_words(["env=cartpole", "training.max_steps=700"])
-    assert config.training.max_episodes == 700 and list(config.agents) == ["ddqn", "ppo"]
+    for steps, episodes in ((700, 700), ("null", 2000)):
+        config = DistillConfig.of_words(["env=cartpole", f"training.max_steps={steps}"])
+        assert config.training.max_episodes == episodes and [*config.agents] == ["ddqn", "ppo"]
 
 
 @pytest.mark.parametrize(("words", "name"), [

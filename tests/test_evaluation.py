@@ -80,6 +80,8 @@ def test_equal_arguments_compile_once():
     for factor in (1.0, 2.0):
         env, params = sejax.load("cliff_walking-rn")
         params = params.replace(weights=jax.tree.map(lambda x, f=factor: f * x, params.weights))
-        sejax.evaluate_agents(sejax.agent_of(env), env, params, env.task, training, keys, devices=1)
+        arguments = sejax.agent_of(env), env, params, env.task, training, keys
+        sejax.evaluate_agents(*arguments, devices=1)
     after = _evaluation_program.cache_info()
     assert (after.misses - before.misses, after.hits - before.hits) == (1, 1)
+    assert refused(sejax.evaluate_agents, *arguments, devices=True) == "devices"

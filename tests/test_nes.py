@@ -192,8 +192,7 @@ def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(na
     strategy = config.make(dims)
     state = strategy.init(jax.random.key(0), jnp.zeros(dims))
     members, _ = jax.jit(strategy.ask)(jax.random.key(1), state)
-    opposite = bool(jnp.abs(members[:16] + members[16:32]).max() < 1e-6)
-    assert strategy.antithetic == opposite
+    assert strategy.antithetic == bool(jnp.abs(members[:16] + members[16:32]).max() < 1e-6)
     assert float(jnp.std(members)) == pytest.approx(std, rel=0.15)
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -335,13 +336,15 @@ def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypat
     assert status == 0 and parsed == LearnConfig.of_sweep(words) and not (tmp_path / "run").exists()
 
 
-def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
-    (best,) = run.learn_all([sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"])])
+def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, tmp_path, capsys):
+    folder = shutil.copytree(uninterrupted, tmp_path / "it's a, b")
+    word = f'run_dir="{folder}"'
+    (best,) = run.learn_all([sejax.config([*TINY, "generations=6", word])])
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     assert best == pytest.approx(max(scores))
     assert f"best search mean {best:.1f}, solved at 0.8" in said
-    assert f"python -m sejax.evaluate proxy={uninterrupted} num_agents=20" in said
+    assert f"python -m sejax.evaluate {shlex.quote(word.replace('run_dir', 'proxy'))} num" in said
     assert "\ngridworld_2x2: " + ("solved" if best >= 0.8 else "learned") in f"\n{said}"
 
 

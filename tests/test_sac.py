@@ -122,8 +122,7 @@ def test_a_squashed_gaussians_density_by_hand():
 
 
 def test_target_critics_start_as_copies_and_the_critics_apart():
-    case = "discrete"
-    agent = agent_of(case)
+    agent = agent_of("discrete")
     fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     assert_equal(fresh.target_critics, fresh.params.critics)
     np.testing.assert_allclose(fresh.params.log_alpha, np.log(0.3), rtol=1e-6)

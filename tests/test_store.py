@@ -35,8 +35,7 @@ def test_an_entry_comes_back_and_another_is_none(folder):
 def test_entries_of_other_settings_are_refused_with_what_differs(folder, monkeypatch):
     error = refusal(Store(folder, SETTINGS | {"seed": 3}, field="work").get, "rounds")
     assert error.field == "work" and "seed (0 there, 3 here)" in str(error)
-    more = SETTINGS | {"devices": 2}
-    assert Store(folder, more, free={"devices"}).get("rounds")
+    assert Store(folder, SETTINGS | {"devices": 2}, free={"devices"}).get("rounds")
     with_default = Store(folder, SETTINGS | {"new": 1})
     monkeypatch.setattr(Store, "completed", lambda _, stored: stored | {"new": 1})
     assert with_default.get("rounds")

@@ -203,5 +203,4 @@ def test_nor_does_it_with_a_key_of_a_preset_or_within_an_agent(folder, refused, 
 @pytest.mark.parametrize("foreign", [x for x in FOREIGN if {"env", "proxy"} & {*x}])
 def test_an_experiment_imports_nothing_that_a_set_names(folder, refused, foreign):
     write_proxy(foreign)
-    words = ["quick=true", "proxy=evil.safetensors", "out=out"]
-    refused(se_histograms.EXPERIMENT.main, *words)
+    refused(se_histograms.EXPERIMENT.main, "quick=true", "proxy=evil.safetensors", "out=out")

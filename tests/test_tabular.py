@@ -46,8 +46,7 @@ def started(agent, q_values=None, epsilon=None):
 
 
 def step(obs, action, reward, discount=0.0, next_obs=0):
-    indices = (np.int32(x) for x in (obs, action, next_obs))
-    obs, action, next_obs = indices
+    obs, action, next_obs = (np.int32(x) for x in (obs, action, next_obs))
     return Transition(obs, action, np.float32(reward), np.float32(discount), next_obs)
 
 

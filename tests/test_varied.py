@@ -29,8 +29,7 @@ NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than o
 
 
 def test_ranges_around_the_default_agent_are_the_papers():
-    paper = sejax.config(["env=cartpole", "preset=paper_performance"]).agent
-    ranges = ranges_of(paper)
+    ranges = ranges_of(sejax.config(["env=cartpole", "preset=paper_performance"]).agent)
     assert ranges["learning_rate"] == pytest.approx((1e-3 / 3, 3e-3, True, False))
     assert ranges["batch_size"] == (42, 384, True, True)
     assert ranges["hidden_size"] == (42, 384, True, True)

@@ -27,7 +27,7 @@ from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import diverged_last, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, registry, require
-from sejax.options.plain import defaults_of, flatten, merge, plugin
+from sejax.options.plain import defaults_of, flatten, from_plain, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact, require_vectors
 from sejax.proxies.io import save
@@ -37,6 +37,7 @@ from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
 from sejax.runs.words import Tree, names_of
+from sejax.training import TrainingConfig
 
 # How many steps students train by default, by kind of actions.
 STEPS = {"continuous": 10_000, "discrete": 2000}
@@ -99,7 +100,8 @@ class DistillConfig(CommandConfig):
             students = {name: {"name": name} for name in agents.USUAL[actions]}
             typed = merge(typed, {"agents": students})
         # An episode of a one-step SE has one step.
-        steps = flatten(typed).get("training.max_steps", STEPS[actions])
+        limit = {"max_steps": flatten(typed).get("training.max_steps")}
+        steps = from_plain(TrainingConfig, limit, "training").max_steps or STEPS[actions]
         lengths = {"max_steps": steps, "max_episodes": steps}
         search = {"alive_bonus": getattr(env, "healthy_reward", 0.0)}
         of_run = LearnConfig.default_layers(typed)

@@ -3,23 +3,14 @@
 `classic`, `gridworld` and `mujoco.tasks` say what each task is (a `TaskSpec`) and make it.
 """
 
-from sejax.envs.base import Task, TaskConfig
-from sejax.envs.spec import Box, Discrete, TaskSpec
-from sejax.envs.wrappers import with_one_done
+from sejax.envs.base import Task as Task
+from sejax.envs.base import TaskConfig
+from sejax.envs.spec import Box as Box
+from sejax.envs.spec import Discrete as Discrete
+from sejax.envs.spec import TaskSpec as TaskSpec
+from sejax.envs.wrappers import with_one_done as with_one_done
 from sejax.options import registry
 from sejax.options.plain import configure, to_plain
-
-__all__ = [
-    "Box",
-    "Discrete",
-    "Task",
-    "TaskSpec",
-    "make",
-    "make_from",
-    "names",
-    "spec_of",
-    "with_one_done",
-]
 
 
 def names() -> list[str]:

@@ -1,5 +1,3 @@
 """Outer optimisers: the paper's NES and evosax's algorithms behind one small contract."""
 
-from sejax.es.base import Strategy
-
-__all__ = ["Strategy"]
+from sejax.es.base import Strategy as Strategy

@@ -15,23 +15,16 @@ Example:
   ((4,), True, False)
 """
 
-from sejax.gym.registration import make, make_sb3, make_vec, register
-from sejax.gym.reward import RewardNetwork
-from sejax.gym.synthetic import SyntheticGymEnv, SyntheticVectorEnv, SyntheticWorld
-from sejax.gym.tasks import GYMNASIUM_IDS, GridWorld, RealTask
-
-__all__ = [
-    "GYMNASIUM_IDS",
-    "GridWorld",
-    "RealTask",
-    "RewardNetwork",
-    "SyntheticGymEnv",
-    "SyntheticVectorEnv",
-    "SyntheticWorld",
-    "make",
-    "make_sb3",
-    "make_vec",
-    "register",
-]
+from sejax.gym.registration import make as make
+from sejax.gym.registration import make_sb3 as make_sb3
+from sejax.gym.registration import make_vec as make_vec
+from sejax.gym.registration import register as register
+from sejax.gym.reward import RewardNetwork as RewardNetwork
+from sejax.gym.synthetic import SyntheticGymEnv as SyntheticGymEnv
+from sejax.gym.synthetic import SyntheticVectorEnv as SyntheticVectorEnv
+from sejax.gym.synthetic import SyntheticWorld as SyntheticWorld
+from sejax.gym.tasks import GYMNASIUM_IDS as GYMNASIUM_IDS
+from sejax.gym.tasks import GridWorld as GridWorld
+from sejax.gym.tasks import RealTask as RealTask
 
 register()

@@ -275,8 +275,7 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         if typing.get_origin(hint) is Literal:
             raise unknown_name(name, str(got), typing.get_args(hint)) from None
         if isinstance(got, Mapping):
-            rule = "must have no fields"
-            raise ConfigError(name, rule, got=got, fix="Leave them out.") from None
+            raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.") from None
         if problem["type"] == "tuple_type":
             use = f"[{shortened(got, 20)}]"
             raise ConfigError(name, "must be a list in brackets", got=repr(got), use=use) from None
@@ -332,4 +331,5 @@ def as_text(value: object) -> str:
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     text = str(value)
-    return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
+    quote = '"' if "'" in text else "'"
+    return f"{quote}{text}{quote}" if any(character in text for character in ",[]'\" ") else text

@@ -179,6 +179,9 @@ def find(group: str, name: str) -> Any:
     rule = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
     rule += f" that derives from {base.__module__}.{base.__name__}"
     require(is_fit, group, rule, got=f"{shortened(name, 40)}, which is {plugin}")
+    # A registered class may serve several names, and then has such a field.
+    is_free = path is not None or "name" not in plugin.__dataclass_fields__
+    require(is_free, group, "must have no field `name`, which holds the choice", got=name)
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
         _NAMES[plugin] = name
     return plugin

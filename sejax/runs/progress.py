@@ -5,7 +5,7 @@ import time
 
 from sejax.bilevel import Bilevel
 from sejax.ops.scores import reaches
-from sejax.options import registry
+from sejax.options import as_text, registry
 from sejax.runs import presets
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
@@ -76,7 +76,7 @@ class RunProgress:
         if any(":" in name for name in agents.values()):
             typed |= {f"agents.{key}": name for key, name in agents.items()}
             typed["agent_hparams"] = "as_learned"
-        words = shlex.join(f"{field}={x}" for field, x in typed.items())
+        words = shlex.join(f"{field}={as_text(x)}" for field, x in typed.items())
         arguments = ", task=YOUR_TASK" if ":" in env else ""
         arguments += ", proxy=YOUR_CONFIG" if ":" in proxy else ""
         self.say(

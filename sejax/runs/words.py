@@ -148,7 +148,9 @@ def chosen_agents(values: Mapping[str, Any]) -> Tree:
         is_list = text.startswith("[") and text.endswith("]")
         names = [unquoted(x) for x in split(text[1:-1] if is_list else text)]
         is_clear = all(names) and not known and len({*names}) == len(names)
-        require(is_clear, word, "must name each agent once", got=text, fix="Set agents=[ddqn,ppo].")
+        every = ",".join(dict.fromkeys(filter(None, [*known, *names])))
+        fix = f"Set agents=[{every or 'ddqn'}] alone."
+        require(is_clear, word, "must name each agent once, in one word", got=text, fix=fix)
         known = names
     return {registry.key_of(name): {"name": name} for name in known}
 
