@@ -235,7 +235,7 @@ def _others(config: CheckConfig, task: Task) -> Agents:
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
     again = known & {*(config.algorithms or ())}
-    require(not again, "algorithms", "must be none of its own agents", got=", ".join(again))
+    require(not again, "algorithms", "must be none of its own agents", got=", ".join(sorted(again)))
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in known}
     for key, agent in (learned | others).items():

@@ -247,7 +247,7 @@ class Fixed(AgentConfig):
 @pytest.mark.parametrize(("make", "field"), [
     (lambda: sejax.DDQNConfig(learning_rate=1e300), "agent.learning_rate"),
     (lambda: sejax.DDQNConfig(learning_rate=5e-324), "agent.learning_rate"),
-    (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.batch_size"),
+    (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.buffer_size"),
     (lambda: make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE), "agent.target_entropy"),
     (lambda: make_agent(Unrelated(), CARTPOLE), "agent"),
     (lambda: make_agent("ppo", CARTPOLE), "agent"),

@@ -50,9 +50,9 @@ class OffPolicyOptions(AgentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        size = self.batch_size
-        most = self.buffer_size
-        require(size <= most, "agent.batch_size", "must fit buffer_size", got=size, use=most)
+        size = self.buffer_size
+        least = self.batch_size
+        require(size >= least, "agent.buffer_size", "must hold a batch", got=size, use=least)
 
     def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""

@@ -102,8 +102,9 @@ def configure(group: str, values: Any, where: str = "") -> Any:
     for field in [name for name in fields if name not in known]:
         built_in = registry.BUILT_IN[group]
         others = [x for x in built_in if field in defaults_of(registry.find(group, x))]
-        rule = f"is no field of {values['name']}, but of {group}={', '.join(others)}."
-        require(not others, f"{where}.{field}", rule)
+        rule = f"is no field of {values['name']}, but of {group}={', '.join(others)}"
+        fix = "Leave it out, or set it for one of these alone."
+        require(not others, f"{where}.{field}", rule, fix=fix)
     return from_plain(cls, fields, where)
 
 
@@ -171,12 +172,12 @@ def defaults_of(cls: type) -> dict[str, Any]:
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """The error for an unknown field, with the nearest known fields."""
     if field in old.INSTEAD:
-        return ConfigError(field, "is no field any more", fix=f"Set {old.INSTEAD[field]}.")
+        return ConfigError(field, "is no field", fix=f"Set {old.INSTEAD[field]}.")
     last = field.rpartition(".")[2]
     field = shortened(field, 40)
     usual = SYMBOLS.get(last, last)
     same = [name for name in known if name.rpartition(".")[2] == usual]
-    close = same or get_close_matches(field, known, 1)
+    close = same or get_close_matches(field, known, 1, 0.7)
     fix = f"Did you mean {close[0]}? " if close else ""
     fix += f"Fields: {listed(same or nearest(field, known))}."
     return ConfigError(field, "is no field", fix=fix)

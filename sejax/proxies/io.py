@@ -295,6 +295,7 @@ def save_set(
       OSError: if it cannot be written; an older file stays as it was.
     """
     require(isinstance(env, ProxyEnv), "env", "must be a proxy's. Write save(path, env, weights).")
+    require(records, "records", "must have one for each proxy; got none.")
     rule = "must be given for a potential-based RN; got None. Set discount=params.discount."
     require(discount is not None or not env.config.needs_discount, "discount", rule)
     gamma = 1.0 if discount is None else discount
@@ -440,6 +441,8 @@ def load_set(
 
 def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
     """The environment that a file's header describes; task and configuration may be given."""
+    is_task = isinstance(task, Task | None)
+    require(is_task, "task", "must be a sejax.Task", got=task, fix="See sejax.envs.make.")
     learned = stored.header
     where = stored.path.name
     proxy = proxy or header.configured("proxy", learned.config["proxy"], where)

@@ -173,6 +173,8 @@ class CommandConfig(Options, ABC):
         unknown = {k: x for k, x in tree.items() if k not in known and not old.is_gone(k, x)}
         if unknown:
             name = next(iter(flatten(unknown) or unknown))
+            is_known = name.partition(".")[0] in registry.GROUPS
+            require(not is_known, shortened(name, 40), "is of other commands. Leave it out.")
             raise unknown_field(name, config.named(config.plain()))
         return config
 

@@ -115,7 +115,9 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self.damaged(name, error) from error
         self._has_entry = True
-        differing = differences(self.completed(stored), self.settings, self._free)
+        differing = differences(stored, self.settings, self._free)
+        # An older version may have left fields out. Reading the others anew could change them.
+        differing = differing and differences(self.completed(stored), self.settings, self._free)
         if differing:
             rule = "must be new or made with the same settings"
             raise self.refused(f"{rule}; got {self.folder}, which differs in {differing}")
