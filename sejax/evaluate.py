@@ -48,8 +48,7 @@ class EvaluateConfig(FreshAgentsConfig):
     @property
     def default_folder(self) -> str:
         """The folder of sweeps, of a shipped proxy or one of the Hub, and on the real task."""
-        is_real = self.proxy == "real"
-        name = f"real-{self.env}" if is_real else self.proxy.removeprefix(hub.SCHEME)
+        name = f"real-{self.env}" if self.proxy == "real" else self.proxy.removeprefix(hub.SCHEME)
         return f"runs/evaluate-{as_file_name(name)}"
 
     @property

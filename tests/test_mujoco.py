@@ -148,8 +148,7 @@ def test_resets_are_drawn_as_gymnasiums(name):
     task, env, num = envs.make(name), in_gymnasium(name), 300
     keys = jax.random.split(jax.random.key(0), num)
     # What `reset_env` begins from, as tested above.
-    draw = jax.jit(jax.vmap(task.env.task.draw_start))
-    ours = np.concatenate(draw(keys), axis=1)
+    ours = np.concatenate(jax.jit(jax.vmap(task.env.task.draw_start))(keys), axis=1)
     env.reset(seed=0)
     theirs = np.empty_like(ours)
     for row in theirs:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import jax
@@ -81,10 +82,10 @@ def test_a_subclass_that_changes_a_default_keeps_marks_and_help_text():
     assert help_texts(Mine) == help_texts(QLearningConfig) != {}
 
 
-def test_numbers_of_numpy_and_jax_become_pythons():
+def test_numbers_of_numpy_and_jax_become_pythons_and_a_path_becomes_text():
     config = Config(size=np.int64(3), rate=np.float32(0.5), share=jnp.float32(0.25),
-                    unruled=np.float64(2), limit=jnp.int32(9))  # fmt: skip
-    assert config == Config(size=3, rate=0.5, share=0.25, unruled=2.0, limit=9)
+                    unruled=np.float64(2), limit=jnp.int32(9), free=Path("x"))  # fmt: skip
+    assert config == Config(size=3, rate=0.5, share=0.25, unruled=2.0, limit=9, free="x")
     assert type(config.size) is type(config.limit) is int
     assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}
     key = jax.random.key(0)

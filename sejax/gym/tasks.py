@@ -135,8 +135,7 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     require(has_limit, "task", f"must have max_steps={limit}", got=task.max_steps)
     is_same = task.action_space == learned.action_space
     rule = f"must have actions of {learned.action_space}"
-    fix = "Wrap it in RescaleAction."
-    require(is_same, "task", rule, got=task.action_space, fix=fix)
+    require(is_same, "task", rule, got=task.action_space, fix="Wrap it in RescaleAction.")
     is_same = signature(task.observation_space) == signature(learned.observation_space)
     rule = f"must observe {shortened(learned.observation_space)}"
     require(is_same, "task", rule, got=task.observation_space)

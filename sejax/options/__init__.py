@@ -312,7 +312,9 @@ def marks(cls: type, name: str) -> dict[str, Any]:
 
 
 def as_python(value: Any) -> Any:
-    """A number or bool of NumPy or jax as Python's; others, traced ones too, stay as they are."""
+    """A number or bool of NumPy or jax as Python's, a path as text; others stay as they are."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     try:
         return value.item() if getattr(value, "shape", None) == () else value
     except (AttributeError, TypeError, NotImplementedError):  # a traced array, a shape, or a key
