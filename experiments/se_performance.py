@@ -139,17 +139,9 @@ def task_name(sets: dict[str, Any]) -> str:
     return names[0] if names else "cartpole"
 
 
-def student(kind: str) -> Any:
-    """The agent around which hyperparameters are drawn.
-
-    Source: paper, table of the hyperparameter ranges of SEs; the authors' performance files.
-    """
-    return sejax.config(["env=cartpole", "preset=paper_performance", f"agent={kind}"]).agent
-
-
 def on_ses(settings: SePerformance, ses: ProxySet, kind: str) -> Condition:
     """The SEs of a set; agents train as long as those that the SEs were learned with."""
-    agent = student(kind)
+    agent = groups.paper_agent(kind)
     training = groups.training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
     # The weights' hash is in the name, so that sets can share a folder.
     names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
@@ -170,7 +162,7 @@ def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str
         test_episodes=settings.test_episodes,
     )
     names = [f"real-{index:02d}" for index in range(settings.real_groups or as_ses)]
-    agent = student(kind)
+    agent = groups.paper_agent(kind)
     return Condition.real(task, names, name=kind, agent=agent, training=training, hparams="varied")
 
 

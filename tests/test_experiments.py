@@ -110,7 +110,8 @@ def tiny(monkeypatch):
         small = {name: value for name, value in TINY_AGENT.items() if name in known}
         return configure("agent", {"name": kind, **small})
 
-    monkeypatch.setattr(agents, "agent_config", tiny_agent)
+    for name in ("agent_config", "paper_agent"):
+        monkeypatch.setattr(agents, name, tiny_agent)
 
 
 def refuse_to_compute(monkeypatch):

@@ -35,8 +35,7 @@ def test_every_task_variant_and_objective_learns(task, variant, objective):
     overrides = [f"env={task}", "proxy=rn", f"proxy.variant={variant}", f"objective={objective}"]
     if task != "cliff_walking":
         overrides += ["agent.warmup_episodes=1", "training.max_steps=1200"]
-    config = sejax.config([*overrides, *SHORT])
-    result = jax.jit(make_learner(config))(jax.random.key(0))
+    result = jax.jit(make_learner(sejax.config([*overrides, *SHORT])))(jax.random.key(0))
     info = jax.device_get(result.info)
     assert np.isfinite(info.incumbent_mean).all() and not info.num_nonfinite.any()
     assert (info.train_steps_mean > 0).all()

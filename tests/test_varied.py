@@ -9,6 +9,7 @@ import pytest
 from support import assert_close, random_columns, raveled, refused, shapes_of
 
 import sejax
+from experiments.common.agents import paper_agent
 from sejax import envs
 from sejax.agents import AgentOptions, make_agent
 from sejax.agents.buffers import Transition, block_size, num_columns, sum_over_batch
@@ -28,8 +29,8 @@ NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than o
 # --- ranges and draws ----------------------------------------------------------------------------
 
 
-def test_ranges_around_the_default_agent_are_the_papers():
-    ranges = ranges_of(sejax.config(["env=cartpole", "preset=paper_performance"]).agent)
+def test_the_studys_ranges_are_the_papers():
+    ranges = ranges_of(paper_agent("ddqn"))
     assert ranges["learning_rate"] == pytest.approx((1e-3 / 3, 3e-3, True, False))
     assert ranges["batch_size"] == (42, 384, True, True)
     assert ranges["hidden_size"] == (42, 384, True, True)

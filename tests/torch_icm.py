@@ -64,8 +64,7 @@ class TorchICM(torch.nn.Module):
 
 def initial(kind):
     agent = curious(kind)
-    params = agent.init(jax.random.key(1), agent.hparams).params
-    return TorchICM(params["params"])
+    return TorchICM(agent.init(jax.random.key(1), agent.hparams).params["params"])
 
 
 if __name__ == "__main__":

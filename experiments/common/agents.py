@@ -302,6 +302,14 @@ def agent_config(kind: str) -> Any:
     return configure("agent", {"name": kind})
 
 
+def paper_agent(kind: str) -> Any:
+    """An agent of the paper's performance figures, around which hyperparameters are drawn.
+
+    Source: paper, table of the hyperparameter ranges of SEs; the authors' performance files.
+    """
+    return sejax.config(["env=cartpole", "preset=paper_performance", f"agent={kind}"]).agent
+
+
 def training_as_learned(
     proxies: Proxy | ProxySet, agent: Any, test_episodes: int, max_steps: int | None = None
 ) -> TrainingConfig:
