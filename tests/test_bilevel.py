@@ -107,6 +107,7 @@ def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
 
 def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     program, _, ((states, infos), (others, _)) = one_device
+    assert others[0].last.weights is not others[0].best.weights  # so that it can be donated
     assert len({float(info.population_mean) for info in infos}) == 3
     assert program.evaluate.num_trainings == 12  # 4 members with two signs, 4 incumbents
     groups = [

@@ -113,8 +113,7 @@ class TorchPPO:
 
 def initial(kind):
     agent = ppo(kind)
-    params = agent.init(jax.random.key(1), agent.hparams).params
-    return TorchPPO(kind, params)
+    return TorchPPO(kind, agent.init(jax.random.key(1), agent.hparams).params)
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
 
 
 def _strongly_typed(x: Any) -> Array:
-    x = jnp.array(x)
+    x = jnp.array(x)  # a copy: a state whose arrays are shared cannot be donated
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
