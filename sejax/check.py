@@ -365,8 +365,10 @@ def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
     cost: dict[str, Any] = {x: record[x] for x in ("real_steps", "cpu_s") if record.get(x)}
     if "real_steps" in cost:
         steps, returns = summary["train_steps_mean"], summary["test_return_mean"]
-        saved = min(steps[TASK], steps[TUNED]) - (steps[OWN] if proxy.env.has_real_dynamics else 0)
-        pays = saved > 0 and reaches(returns[OWN], float(proxy.task.solved_reward))
+        misses = ~reaches(returns, proxy.task.solved_reward)
+        best = min((TASK, TUNED), key=lambda x: (misses[x], steps[x]))
+        saved = steps[best] - (steps[OWN] if proxy.env.has_real_dynamics else 0)
+        pays = saved > 0 and not misses[OWN]
         cost["agents_to_break_even"] = ceil(cost["real_steps"] / saved) if pays else "never"
     return cost
 

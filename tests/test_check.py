@@ -7,6 +7,7 @@ import pickle
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 from support import is_drawn, refusal, refuse, refused
 
@@ -132,6 +133,13 @@ def test_a_killed_check_goes_on_to_the_same(whole, tmp_path, monkeypatch):
     how = proxy.params.weights, proxy.config, proxy.discount
     sejax.save(path := tmp_path / "mine.safetensors", env, *how)
     assert "proxy.min_steps (1" in str(refusal(run, path, out_dir=tmp_path / "other"))
+
+
+def test_agents_that_fail_on_the_task_save_nothing(whole):
+    worlds = {checking.TASK: (40, -1.0), checking.TUNED: (50, 1.0), checking.OWN: (9, 1.0)}
+    summary = pd.DataFrame(worlds, ["train_steps_mean", "test_return_mean"]).T
+    cost = checking._cost(sejax.load_proxy(whole[0] / "mine.safetensors"), summary)
+    assert cost["agents_to_break_even"] == 20  # of 1000 real steps
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_a_model_of_another_algorithm_is_refused(tmp_path, monkeypatch):
 def test_actions_of_uneven_bounds_are_those_of_the_task(monkeypatch):
     """A task's own actions lie in [-1, 1], if the environment's do not lie in some [-x, x]."""
     space = SimpleNamespace(low=np.zeros(2), high=np.float32([1, 4]))
-    actions = np.tile([0.5, 4.0], (3, 1))
+    actions = np.tile([0.5, 5.0], (3, 1))  # one is beyond the bounds
     model = SimpleNamespace(action_space=space, predict=lambda obs, deterministic: (actions, None))
     sb3 = SimpleNamespace(SAC=SimpleNamespace(load=lambda path, device: model))
     monkeypatch.setitem(sys.modules, "stable_baselines3", sb3)

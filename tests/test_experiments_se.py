@@ -1,5 +1,7 @@
 """The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pandas as pd
@@ -60,6 +62,9 @@ def test_a_cost_whose_generation_was_lost_is_written_again(tmp_path):
     assert runs.read_costs(path, 3).tolist() == []
     path.write_text("0.500\n0.250\n7.000\n")
     assert runs.read_costs(path, 2).tolist() == [0.5, 0.25]
+    # Generations 3 and 4 were not timed.
+    runs.timed(SimpleNamespace(advance=print), path).advance(SimpleNamespace(generation=5), 2)
+    assert np.isnan(runs.read_costs(path, 9)).tolist() == [False] * 3 + [True] * 2 + [False] * 2
     path.write_text("0.500\nx")
     with pytest.raises(ConfigError, match=r"cpu_s\.txt is damaged"):
         runs.read_costs(path, 2)

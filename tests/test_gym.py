@@ -201,6 +201,9 @@ def test_lanes_are_single_environments(name, mode):
     assert num_ended > num_envs
     for seed in (None, 7, [3, None, 8]):
         assert_same(lanes.reset(seed=seed), singles.reset(seed=seed))
+    with pytest.raises(gymnasium.error.Error, match="-1"):
+        lanes.reset(seed=[1, 2, -1])
+    assert_same(lanes.reset(), singles.reset())  # the refused seeds changed nothing
 
 
 def test_gymnasium_makes_the_shipped_ones_by_their_names():
@@ -430,7 +433,9 @@ def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
 
 
 def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    path, task = stored(jax_se()), RealTask.of_env(gymnasium.make("CartPole-v1"))
+    path, task = stored(jax_se()), RealTask.of_env(real := gymnasium.make("CartPole-v1"))
+    (before, _), _ = real.reset(seed=7), task.starts(np.random.default_rng(0))
+    assert np.allclose(real.unwrapped.state, before)  # a copy drew that start
     assert refused(make, path, task) == "task"
     for given in (None, "CartPole-v1", dataclasses.replace(task, max_steps=200)):
         assert make(path, given).world.max_steps == 200

@@ -243,7 +243,8 @@ def test_what_does_not_fit_is_one_message():
 def test_the_network_sees_the_tasks_own_observations():
     cartpole = gymnasium.make("CartPole-v1")
     normalized = wrappers.TransformReward(wrappers.NormalizeObservation(cartpole), float)
-    for env in (normalized, wrappers.NormalizeReward(cartpole), wrappers.ClipReward(cartpole, 0)):
+    rewards = (wrappers.NormalizeReward(cartpole), wrappers.ClipReward(cartpole, 0))
+    for env in (normalized, *rewards, wrappers.MaxAndSkipObservation(cartpole)):
         assert refused(RewardNetwork, env, "cartpole-rn") == "env"
     assert wrappers.NormalizeObservation(RewardNetwork(cartpole, "cartpole-rn")).reset(seed=0)
     pendulum = gymnasium.make("InvertedPendulum-v5")  # 4 numbers too, and other actions

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import assert_close, numpy_forward, random_like, shapes_of
 
-from sejax.ops.networks import MLP, PRELU_SLOPE, affine, fast_tanh, tanh
+from sejax.ops.networks import MLP, affine, fast_tanh, tanh
 from sejax.options import Activation
 
 
@@ -79,12 +79,6 @@ def test_layer_norm_of_a_feature_major_batch_equals_that_of_single_inputs():
     batch = np.float32(np.random.default_rng(3).normal(size=(4, 7)))  # [feature, batch]
     alone = np.stack([apply(params, x) for x in batch.T], axis=1)
     np.testing.assert_allclose(apply(params, batch), alone, rtol=1e-5, atol=1e-6)
-
-
-def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
-    net = MLP(3, hidden_size=5, num_layers=2, activation="prelu", learn_prelu_slope=True)
-    slope = net.init(jax.random.key(0), jnp.zeros(4))["params"]["prelu_slope"]
-    assert slope.shape == () and slope == PRELU_SLOPE == 0.25
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_shares, drawing, numpy_forward, paper_ppo, raveled, refused, unraveled
+from support import assert_shares, drawing, numpy_forward, paper_ppo, raveled, unraveled
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
@@ -158,11 +158,6 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
     assert given.rollout_length(max_steps) == 17
     assert given.steps_before_learning(9, max_steps) == 17 * action_repeat
     assert given.steps_before_learning(1, max_steps) == 17  # a decision is one step
-
-
-def test_a_minibatch_has_at_least_two_steps():
-    config = dataclasses.replace(GAE, num_minibatches=7)
-    assert refused(ppo, "gae", config) == "agent.num_minibatches"
 
 
 # --- policies ------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from sejax.distill.policy_search import (
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_fixed, make_recorder, make_tester
+from sejax.ops.scores import reaches
 from sejax.proxies.base import ProxyEnv, ProxyParams
 
 Controller = Callable[[Array], Array]  # an observation [obs_dim] to an action
@@ -194,7 +195,7 @@ def search_teacher(task: Task, real_steps: int, seed: int) -> Teacher:
         used += int(steps_used) + int(tests.num_steps.sum())
         if float(tests.returns.mean()) > best_return:
             best, best_return = policy, float(tests.returns.mean())
-        if best_return >= task.solved_reward or used >= real_steps:
+        if reaches(best_return, task.solved_reward) or used >= real_steps:
             break
     return Teacher(agent, best, key_copy, used, time.process_time() - started)
 

@@ -13,6 +13,7 @@ import pandas as pd
 from experiments.common.agents import Measure
 from sejax import Task, TrainingConfig
 from sejax.evaluation import make_tested_trainer
+from sejax.ops.scores import reaches
 
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
 DECIMALS = 2  # of stored test returns
@@ -63,7 +64,7 @@ def on_grid(curves: pd.DataFrame, grid: np.ndarray) -> np.ndarray:
 def steps_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
     """Training steps of an agent until `WINDOW` tests have a mean high enough; inf if never."""
     full = curve["test_return"].rolling(WINDOW).mean().to_numpy()
-    solved = np.flatnonzero(full >= solved_reward)
+    solved = np.flatnonzero(reaches(full, solved_reward))
     return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf
 
 

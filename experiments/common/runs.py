@@ -20,6 +20,7 @@ import sejax
 from experiments.common.experiment import Settings, setting
 from experiments.common.tables import summary_by
 from sejax.ops.files import write_text
+from sejax.ops.scores import reaches
 from sejax.options import ConfigError, Count, require
 from sejax.runs import run_directory, session
 from sejax.runs.chunks import Chunks, make_chunks
@@ -119,7 +120,7 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
 
 def generations_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
     """Generations of a run until the first whose incumbent mean is high enough; inf if none is."""
-    solved = curve["generation"][curve["incumbent_mean"] >= solved_reward]
+    solved = curve["generation"][reaches(curve["incumbent_mean"], solved_reward)]
     return float(solved.iloc[0]) + 1 if len(solved) else np.inf
 
 
@@ -139,7 +140,7 @@ def summarise(curves: pd.DataFrame, by: Sequence[str], solved_reward: float) -> 
             "generations": len(curve),
             "generations_to_solve": to_solve,
             "steps_to_solve": spent["env_steps_total"].max() if is_solved else np.inf,
-            "cpu_s_to_solve": spent["cpu_s"].sum(min_count=1) if is_solved else np.inf,
+            "cpu_s_to_solve": spent["cpu_s"].sum(skipna=False) if is_solved else np.inf,
             "best_incumbent_mean": curve["incumbent_mean"].max(),
             "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
             "steps": curve["env_steps_total"].max(),
@@ -161,7 +162,9 @@ def timed(chunks: Chunks, path: Path) -> Chunks:
     """
 
     def advance(state: Any, length: int) -> tuple[Any, Any]:
-        before = read_costs(path, int(state.generation))
+        first = int(state.generation)
+        known = read_costs(path, first)
+        before = np.pad(known, (0, first - len(known)), constant_values=np.nan)
         started = time.process_time()
         result = jax.block_until_ready(chunks.advance(state, length))
         each = (time.process_time() - started) / length

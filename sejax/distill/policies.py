@@ -104,7 +104,7 @@ def _checked(act: Actor, task: Task) -> Actor:
         got = f"{list(actions.shape)}, such as {actions.ravel()[:3]}"
         is_fit = actions.shape == shape and known.all()
         require(is_fit, "policy", f"must give {expected} of the shape {list(shape)}", got=got)
-        return actions
+        return actions if count is not None else actions.clip(-task.max_action, task.max_action)
 
     return checked
 

@@ -32,9 +32,8 @@ def forward(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
 
 
 def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
-    activate = ACTIVATIONS[activation]
     for i, (kernel, bias) in enumerate(layers):
-        x = (activate(x) if i else x) @ kernel
+        x = (ACTIVATIONS[activation](x) if i else x) @ kernel
         x += bias
     return x
 

@@ -275,7 +275,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         for i, number in enumerate(seed):
             if number is not None or generators[i] is None:
                 generators[i], _ = gymnasium.utils.seeding.np_random(number)
-                self._num_used[i] = self._drawn.shape[1]  # starts drawn before are void
+        # Starts drawn before are void.
+        self._num_used[[x is not None for x in seed]] = self._drawn.shape[1]
         self._generators = generators
         self._ended = np.zeros(self.num_envs, np.bool_)
         self.begin(~self._ended)

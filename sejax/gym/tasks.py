@@ -1,5 +1,6 @@
 """The real tasks behind proxies, as Gymnasium has them."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -60,7 +61,9 @@ class RealTask:
 
     @classmethod
     def of_env(cls, env: Env) -> "RealTask":
-        """A task given as an environment with Gymnasium's `TimeLimit` around it.
+        """A task given as an environment that `gymnasium.make` has made with a step limit.
+
+        A copy of it draws the starts.
 
         Raises:
           ConfigError: if it has no such limit.
@@ -71,7 +74,7 @@ class RealTask:
             observation_space=env.observation_space,
             action_space=env.action_space,
             max_steps=int(limit or 0),
-            starts=partial(_first_observation, env),
+            starts=partial(_first_observation, copy.deepcopy(env)),
         )
 
 

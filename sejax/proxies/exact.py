@@ -147,8 +147,8 @@ def gaussian(states: np.ndarray, independent: bool = False) -> list[Layer]:
     spread = np.cov(states, rowvar=False).reshape(size, size)
     if independent:
         spread = np.diag(np.diag(spread))
-    # A number that does not vary gets a deviation far below rounding.
-    root = np.linalg.cholesky(spread + 1e-10 * np.eye(size) * max(1.0, np.abs(spread).max()))
+    # Far below rounding of each number; one that does not vary gets a deviation of 1e-6.
+    root = np.linalg.cholesky(spread + 1e-10 * np.diag(np.maximum(np.diag(spread), 1e-2)))
     kernel = root - np.eye(size)
     shift = np.full(size, _MOST_NOISE)
     return [(np.eye(size), shift), (kernel, states.mean(axis=0) - kernel @ shift)]

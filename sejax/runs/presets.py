@@ -38,8 +38,7 @@ def _sections_in(stem: str, known: dict[str, Tree]) -> dict[str, Tree]:
     sections: dict[str, Tree] = {}
     for name, section in yaml.safe_load(PRESETS.get(stem, "{}")).items():
         like = section.pop("like", None)
-        below = (known | sections)[like] if like else {}
-        sections[name] = merge(below, section)
+        sections[name] = merge((known | sections)[like] if like else {}, section)
     return sections
 
 

@@ -104,8 +104,7 @@ def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:
     """Values by their names in words as a tree: `env=acrobot` is `env.name=acrobot`."""
     tree: Tree = {"agents": chosen_agents(values)}
     for name in [name for name in values if name not in CHOOSE_ALL]:
-        is_choice = name in groups or BY_KEY.fullmatch(name)
-        path = f"{name}.name" if is_choice else name
+        path = f"{name}.name" if name in groups or BY_KEY.fullmatch(name) else name
         value = values[name]
         for part in reversed(path.split(".")):
             value = {part: value}
