@@ -231,7 +231,7 @@ def make_bilevel(
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Bilevel:
-    """Builds Algorithm 1 from its parts; each is an object or a configuration that makes one.
+    """Builds Algorithm 1 from its parts; each but the agent may be a configuration that makes it.
 
     Args:
       task: the real task.

@@ -164,8 +164,7 @@ class Scoring:
 
         These are numbered last. So their numbers lie beyond values that lack them, and drop out.
         """
-        by_agent = self.layout.trainings_of
-        return jnp.stack([statistic(values[x[x < values.size]]) for x in by_agent])
+        return jnp.stack([statistic(values[x[x < values.size]]) for x in self.layout.trainings_of])
 
 
 def with_diverged_last(

@@ -20,7 +20,7 @@ from sejax.evaluate import evaluate
 from sejax.evaluation import make_evaluator
 from sejax.ops.checksummed import pack, unpack
 from sejax.options.plain import configure, to_plain
-from sejax.runs.fresh_agents import summarise, worlds_of
+from sejax.runs.fresh_agents import loaded, summarise, worlds_of
 
 # An SE for DDQN agents, whose episodes may be as long as the task's.
 SE = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", "proxy.done=soft",
@@ -217,9 +217,8 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     bare = tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
     assert refused(sejax.load_proxy(bare).learned_agents) == "agent"
-    assert (
-        refused(evaluate_config, f"proxy={bare}") == "agents.my_Agent"
-    )  # no other agent takes its place
+    # No other agent takes its place.
+    assert refused(evaluate_config, f"proxy={bare}") == "agents.my_Agent"
     assert list(evaluate_config(f"proxy={bare}", "agent=sarsa").agents) == ["sarsa"]
     assert "my" not in sys.modules
 
@@ -242,6 +241,14 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     theirs.write_bytes(pack(tensors, "sejax", header))
     assert evaluate_config(f"proxy={theirs}").agent == sejax.DDQNConfig()
     assert "their" not in sys.modules
+
+
+def test_a_proxy_of_a_task_made_by_hand_takes_the_typed_task(tmp_path, monkeypatch):
+    env = sejax.config(["env=gridworld_2x2"]).parts()["proxy"]
+    monkeypatch.setitem(vars(env.task), "origin", None)
+    sejax.save(path := tmp_path / "mine.safetensors", env, env.init_weights(jax.random.key(0)))
+    config = evaluate_config(f"proxy={path}", "env=sejax.envs.gridworld:GridWorld2x2")
+    assert loaded(config).task.is_solvable
 
 
 def test_an_evaluations_mean_leaves_no_agent_out():

@@ -237,12 +237,10 @@ def test_settings_are_complete_and_say_which_command_makes_them():
     assert given().command() == " ".join(command)
 
 
-@pytest.mark.parametrize(
-    ("word", "field"),
-    [("agents=[dqn]", "agents"), ("agents=ddqn,ppo", "agents"), ("num_agents=0", "num_agents"),
-     ("numagents=3", "numagents"), ("quick", "an override"),
-     ("run.env=acrobot", "run.env")],  # else filed as CartPole's
-)  # fmt: skip
+@pytest.mark.parametrize(("word", "field"), [
+    ("agents=[dqn]", "agents"), ("agents=ddqn,ppo", "agents"), ("num_agents=0", "num_agents"),
+    ("numagents=3", "numagents"), ("quick", "an override"), ("run.env=acrobot", "run.env"),
+])  # fmt: skip
 def test_words_that_cannot_work_are_refused(word, field):
     assert refused(given, word) == field
 

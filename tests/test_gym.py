@@ -234,11 +234,9 @@ def test_ends_are_drawn_with_their_probability():
 
 
 @ALONE_AND_MANY
-@pytest.mark.parametrize(
-    "outputs",
-    [{"state": np.inf}, {"reward": np.nan}, {"done": -np.inf}, {"state": 2e6}, {"reward": -2e6}],
-    ids=str,
-)
+@pytest.mark.parametrize("outputs", [
+    {"state": np.inf}, {"reward": np.nan}, {"done": -np.inf}, {"state": 2e6}, {"reward": -2e6},
+], ids=str)  # fmt: skip
 @pytest.mark.parametrize(("mode", "min_steps"), [("soft", 1), ("soft", 2), ("bernoulli", 1)])
 def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(
     mode, min_steps, outputs, num_envs

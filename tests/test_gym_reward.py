@@ -79,10 +79,9 @@ def phi(weights, *inputs):
 
 
 @pytest.mark.parametrize("variant", NETWORKS)
-@pytest.mark.parametrize(
-    ("zero_at_terminal", "output_scale", "discount"),
-    [(False, 1.0, None), (True, 1.0, 0.99), (False, 0.1, None)],  # None: that of the RN's agent
-)
+@pytest.mark.parametrize(("zero_at_terminal", "output_scale", "discount"), [
+    (False, 1.0, None), (True, 1.0, 0.99), (False, 0.1, None),  # None: that of the RN's agent
+])  # fmt: skip
 def test_every_variant_pays_what_its_equation_says(
     stored_rn, variant, zero_at_terminal, output_scale, discount
 ):

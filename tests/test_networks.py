@@ -81,10 +81,9 @@ def test_layer_norm_of_a_feature_major_batch_equals_that_of_single_inputs():
     np.testing.assert_allclose(apply(params, batch), alone, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("num_inputs", "num_outputs"),
-    [(3, 2), (20, 2), (3, 20), (20, 20), (64, 64), (128, 128)],  # wide ones are not transposed
-)
+@pytest.mark.parametrize(("num_inputs", "num_outputs"), [
+    (3, 2), (20, 2), (3, 20), (20, 20), (64, 64), (128, 128),  # wide ones are not transposed
+])  # fmt: skip
 def test_affine_and_its_gradient_equal_the_plain_product(num_inputs, num_outputs):
     shapes = [(num_outputs, num_inputs), (num_outputs,), (num_inputs, 7), (num_outputs, 7)]
     *args, weight = random_like([np.zeros(shape) for shape in shapes], scale=1.0)

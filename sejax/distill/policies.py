@@ -134,10 +134,9 @@ def _of_agent(name: str, task: Task, num_steps: int, key: Array) -> Actor:
     with options.errors_of("agent", "policy"):  # it may not fit the task
         agent = make_agent(configure("agent", {"name": name}), task)
     training = TrainingConfig(max_steps=num_steps, max_episodes=num_steps)
-    train = make_trainer(agent, task.env, training)
     key_train, key_act = jax.random.split(key)
     print(f"training a {name} on {task.name} for {num_steps:,} steps ...", flush=True)
-    state = jax.jit(train)(key_train, task.params).agent_state
+    state = jax.jit(make_trainer(agent, task.env, training))(key_train, task.params).agent_state
     act = functools.partial(agent.act, key_act, state, explore=False)
     return jax.jit(jax.vmap(lambda obs: agent.env_action(act(obs))))
 

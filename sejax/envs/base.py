@@ -43,7 +43,7 @@ class Task(TaskSpec):
 
     Attributes:
       origin: plain values from which `sejax.envs.make` makes the task again. None for a task made
-        by hand: whoever loads a proxy of it must pass the task.
+        by hand, which must be passed where agents on a proxy of it are tested.
 
     Raises:
       ConfigError: for spaces that are neither discrete nor boxes, actions without bounds, and an

@@ -26,9 +26,9 @@ def make(
     Args:
       source: a run directory, a safetensors file of one proxy, or the name of one that ships with
         the package.
-      task: the real task, or its id in Gymnasium; needed unless sejax and Gymnasium both know the
-        task. Episodes of an SE keep the step limit in its file. An RN needs an id here;
-        `RewardNetwork` wraps any environment.
+      task: the real task, or its id in Gymnasium; needed by RNs, and by SEs that begin in states
+        of the task, unless sejax and Gymnasium both know the task. Episodes of an SE keep the step
+        limit in its file. An RN needs an id here; `RewardNetwork` wraps any environment.
       render_mode: for an RN's real task, as in `gymnasium.make`; an SE has no pictures, and ignores
         it.
 

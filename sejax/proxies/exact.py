@@ -40,9 +40,9 @@ def make_exact(
 
     Args:
       task: the real task, whose observations are vectors.
-      layers: the policy, affine maps of the observation with ReLUs between them. Continuous actions
-        are its output `[action_dim]`, clipped to the task's bounds; the best discrete action is the
-        one with the largest output `[num_actions]`.
+      layers: the policy, affine maps `([out, in], [out])` of the observation with ReLUs between
+        them. Continuous actions are its output `[action_dim]`, clipped to the task's bounds; the
+        best discrete action is the one with the largest output `[num_actions]`.
       states: observations that the policy visited, `[state, obs_dim]`, in the task's units.
       independent_starts: whether the numbers of an initial state are independent; else they have
         the covariance of the visited states.

@@ -310,7 +310,7 @@ def save_set(
     if not is_set:
         tensors = {name: x[0] for name, x in tensors.items()}
     # A name that is not registered, as the registered one may make another task.
-    origin = env.task.origin or {"name": f"{env.task.name}, made by hand"}
+    origin = env.task.origin or {"name": f"{env.task.name}{header.BY_HAND}"}
     # `run_dir` would be a path of this machine.
     parts = {"proxy": to_plain(env.config, "proxy"), "env": origin, "run_dir": None}
     try:
@@ -359,7 +359,8 @@ def load(
         (`sejax.pretrained()`), or one on the Hugging Face Hub: `hf://USER/REPO`.
       task: the real task; needed if no registered name makes it, because a file's names are never
         imported. An SE with initial states of its own needs neither the task nor the task's
-        package: its file has the spaces. Only resetting or stepping the real task then fails.
+        package: its file has the spaces, but no solved score. Only resetting or stepping the real
+        task then fails.
       proxy: the proxy's configuration; needed for a kind of proxy of your own.
 
     Returns:

@@ -156,8 +156,7 @@ class SyntheticConfig(ProxyConfig):
           ConfigError: if the form of the reward does not fit the task's actions.
         """
         self.require_task(task, task.name)
-        env_class = BanditEnv if self.is_bandit else SyntheticEnv
-        return env_class(task, self)
+        return BanditEnv(task, self) if self.is_bandit else SyntheticEnv(task, self)
 
 
 @struct.dataclass

@@ -187,9 +187,9 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     if config.proxy_kind is not None:
         proxy_config = configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
     proxy = load_proxy(path, task, proxy_config, "proxy")
-    name = proxy.task.name
-    is_same = config.env in (None, name, proxy.config["env"].get("name"))
-    require(is_same, "env", "must be the proxy's own task", got=config.env, use=name)
+    own = str(stored["env"].get("name"))
+    is_same = config.env in (None, proxy.task.name, own) or own.endswith(header.BY_HAND)
+    require(is_same, "env", "must be the proxy's own task", got=config.env, use=own)
     return proxy
 
 

@@ -153,8 +153,7 @@ class RemoteChunks(Chunks):
             return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
 
         state = jax.eval_shape(bilevel.init, jax.random.key(0))
-        shapes = jax.eval_shape(evaluate, state)
-        no_outcomes = jax.tree.map(jnp.zeros_like, shapes)
+        no_outcomes = jax.tree.map(jnp.zeros_like, jax.eval_shape(evaluate, state))
         jitted = jax.jit(generation, compiler_options=compiler_options())
         return jitted.lower(state, no_outcomes).compile(), no_outcomes
 
