@@ -70,7 +70,11 @@ class Reacher(environment.Environment[ReacherState, ReacherParams]):
 
 
 def make_reacher(size: int = 3) -> sejax.Task:
-    """The reacher in a room of so many metres."""
+    """The reacher in a room.
+
+    Args:
+      size: metres of the room
+    """
     params = ReacherParams(size=float(size))
     return sejax.Task(name=f"reacher{size}", env=Reacher(), params=params, solved_reward=-1.0)
 

@@ -193,8 +193,7 @@ def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1",
                                   "preset: other.yaml", "agent: {batch_size: {x: 1}}",
-                                  "1: 2", "\x00", "- &a [*a]"],
-)  # fmt: skip
+                                  "1: 2", "\x00", "- &a [*a]"])  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
     refused(f"preset={tmp_path / 'bad.yaml'}")
@@ -316,7 +315,8 @@ def test_a_command_ends_bad_words_with_one_message_and_status_2(
     (run, ["agents=[ddqn,ppo]"], LearnConfig, ["mixture.weights.ddqn=1.0  # share"]),
     (run, ["preset=paper", "seed=3,4"], LearnConfig, ["seed=3 (typed)", "=83 (preset=paper)"]),
     (evaluate, ["proxy=cartpole"], EvaluateConfig, ["agents.ppo.epochs=10  # passes", "(proxy)"]),
-    (distill, [], CopyConfig, ["search.policy_error=0.1", "copy.hidden_size=32  #"]),
+    (distill, ["env=examples.own_task:make_reacher"], CopyConfig, ["search.policy_error=0.1",
+     "copy.hidden_size=32  #", "env.size=3  # metres"]),
 ])  # fmt: skip
 def test_help_shows_each_field_with_its_value_and_text(module, words, schema, expected):
     said = module.help_text(words)

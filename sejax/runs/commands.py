@@ -117,10 +117,10 @@ def field_lines(
 
 
 def help_texts(cls: type) -> dict[str, str]:
-    """The texts of attributes by name, from the docstrings of a class and its bases."""
+    """The texts of attributes by name, from the docstrings of a class, its bases, or a function."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        rest = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")[2]
+        rest = re.split("(?:Attributes|Args):\n", inspect.cleandoc(base.__doc__ or ""))[-1]
         section = re.split(r"\n\n(?=\S)", rest)[0]
         entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
