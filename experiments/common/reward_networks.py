@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import filelock
 import pandas as pd
 
 import sejax
@@ -223,12 +224,13 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         curve = runs.learn(configs, option="rns_dir")
         curve = curve[curve.columns.intersection(KEPT)].assign(variant=variant)
         file = path.with_name("curves.csv.xz")  # of all variants
-        if file.exists():
-            before = read_rows(file)  # with those beyond, if stopped right here
-            first = config.seed if there else 0
-            is_anew = (before["variant"] == variant) & (before["seed"] >= first)
-            curve = pd.concat([before[~is_anew], curve], ignore_index=True)
-        write_rows(file, curve)
+        with filelock.FileLock(folder.parent / "curves.lock"):  # another variant may end too
+            if file.exists():
+                before = read_rows(file)  # with those beyond, if stopped right here
+                first = config.seed if there else 0
+                is_anew = (before["variant"] == variant) & (before["seed"] >= first)
+                curve = pd.concat([before[~is_anew], curve], ignore_index=True)
+            write_rows(file, curve)
         runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
     return there[: settings.learned]
