@@ -31,6 +31,7 @@ from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import worst_tenth
 from sejax import envs
+from sejax.ops.scores import reaches
 from sejax.options import Count, Positive
 
 HPARAMS = ("varied", "default")
@@ -238,13 +239,13 @@ def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         last = mine[mine["steps"] == most]
         returns = last["test_return"]
-        solves = mine["steps"].where(mine["test_return"] >= solved_reward, np.inf)
+        solves = mine["steps"].where(reaches(mine["test_return"], solved_reward), np.inf)
         steps = solves.groupby([mine["group"], mine["agent"]]).min().median()  # of equal seeds
         return tables.mean_columns(returns, "test_return", last["group"]) | {
             "median": returns.median(),
             "worst_tenth": worst_tenth(returns),
             "worst": returns.min(),
-            "solved": (returns >= solved_reward).mean(),
+            "solved": reaches(returns, solved_reward).mean(),
             "median_steps_until_solved": steps if settings.shares else np.nan,
             "num_proxies": last["group"].nunique(),
             "num_agents": len(last),

@@ -30,6 +30,7 @@ from experiments.common.agents import Condition, Group, shipped
 from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
+from sejax.ops.scores import reaches
 from sejax.options import ConfigError, Count, require
 
 BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
@@ -246,7 +247,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
         name = mine["task"].iloc[0]
         columns: dict[str, Any] = {"label": STUDENTS[mine["students"].iloc[0]]}
         for (se, steps), returns in mine.groupby(["se", "steps"])["test_return"]:
-            solved = (returns >= envs.make(name).solved_reward).mean()
+            solved = reaches(returns, envs.make(name).solved_reward).mean()
             values = returns.mean(), returns.median(), returns.min(), solved, len(returns)
             for measure, value in zip(MEASURES, values, strict=True):
                 columns[f"{se}_{measure}_{steps:.0f}"] = value

@@ -28,6 +28,7 @@ from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import RunSettings
 from experiments.common.shards import stack, unstack
 from sejax import Task, envs
+from sejax.ops.scores import reaches
 from sejax.options import Count
 from sejax.runs.chunks import make_chunks
 
@@ -177,7 +178,7 @@ def summarise(curves: pd.DataFrame, agents: pd.DataFrame, solved_reward: float) 
         columns: dict[str, Any] = {
             "runs": len(mine),
             "first_solved": int(np.isfinite(mine["generations_to_solve"]).sum()),
-            "solved": int((of_ses >= solved_reward).sum()),
+            "solved": int(reaches(of_ses, solved_reward).sum()),
             **mine[costs].median(),
             **mine[["cpu_s", "steps"]].mean(),
             "episode_steps": far["train_steps"].sum() / far["train_episodes"].clip(lower=1).sum(),

@@ -28,6 +28,7 @@ from experiments.common.agents import SE_AGENTS, Condition, return_columns
 from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, TrainingConfig, envs
+from sejax.ops.scores import reaches
 from sejax.options import Count, require, shortened
 
 NUM_BEST = 5
@@ -112,7 +113,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
 
 def solved_ones(ses: ProxySet) -> Any:
     """The SEs whose score, a mean return, reached the task's threshold."""
-    return ses[ses.scores >= ses.task.solved_reward]
+    return ses[reaches(ses.scores, ses.task.solved_reward)]
 
 
 def load_sets(settings: SePerformance) -> dict[str, Any]:
@@ -203,7 +204,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
         for column in ("train_steps", "train_episodes", "test_return"):
             row |= tables.mean_columns(mine[column], column, ses)
         returns = mine["test_return"]
-        row |= {"solved": (returns >= solved_reward).mean()}
+        row |= {"solved": reaches(returns, solved_reward).mean()}
         return row | {"test_return_worst_tenth": worst_tenth(returns)}
 
     return tables.summary_by(agents, ["kind", "setting"], statistics)

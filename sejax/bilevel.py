@@ -231,7 +231,7 @@ def make_bilevel(
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Bilevel:
-    """Builds Algorithm 1 from its parts; each but the agent may be a configuration that makes it.
+    """Builds Algorithm 1 from its parts; proxy, es and objective may be configurations.
 
     Args:
       task: the real task.

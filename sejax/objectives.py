@@ -177,7 +177,7 @@ class RewardThreshold(ObjectiveConfig):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        fix = "Give the task a solved_reward, or set objective=max_reward."
+        fix = "Give your Task or env=gymnax/ID a solved_reward, or set objective=max_reward."
         require(task.is_solvable, "objective", f"needs {task.name}'s solved reward", fix=fix)
 
         def score(outcome: Outcome) -> Array:

@@ -85,3 +85,4 @@ def test_equal_arguments_compile_once():
     after = _evaluation_program.cache_info()
     assert (after.misses - before.misses, after.hits - before.hits) == (1, 1)
     assert refused(sejax.evaluate_agents, *arguments, devices=True) == "devices"
+    assert refused(sejax.evaluate_agents, *arguments, num_parallel=-1) == "num_parallel"

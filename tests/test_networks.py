@@ -74,6 +74,11 @@ def test_rational_tanh_is_tanh_within_its_stated_error(function, cut, error):
     np.testing.assert_allclose(jax.grad(jax.grad(function))(0.5), -0.72686198, atol=1e-5)
 
 
+def test_a_learned_prelu_slope_is_one_number_that_starts_at_a_quarter():
+    net = MLP(3, hidden_size=5, num_layers=2, activation="prelu", learn_prelu_slope=True)
+    assert net.init(jax.random.key(0), jnp.zeros(4))["params"]["prelu_slope"] == 0.25
+
+
 def test_layer_norm_of_a_feature_major_batch_equals_that_of_single_inputs():
     apply, params = network(4, 3, 5, 2, "tanh", layer_norm=True)
     batch = np.float32(np.random.default_rng(3).normal(size=(4, 7)))  # [feature, batch]

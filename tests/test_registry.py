@@ -155,8 +155,7 @@ wrong = lambda task: 3
 named = lambda task, name="pole": 3
 too_few = lambda: 3
 of_any = lambda task, *values, **more: 3
-Named = dataclasses.make_dataclass("Named", [("name", str, "pole")], namespace={"make": named})
-Bare = dataclasses.make_dataclass("Bare", [], namespace={"make": too_few})
+Named = dataclasses.make_dataclass("Named", [("name", str, "pole")], namespace={"make": wrong})
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
@@ -203,7 +202,6 @@ def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     ("named", {}, "must take (task, option=default, ...)"),
     ("too_few", {}, "must take (task, option=default, ...)"),
     ("Vague", {"scale": 2}, "'Unknown' is not defined"), ("a_number.nope", {}, "'nope'"),
-    ("Bare", {}, "with make(task)"),
     ("of_any", {}, "must take (task, option=default, ...)"), ("Named", {}, "no field `name`"),
 ])  # fmt: skip
 def test_what_is_no_plugin_is_one_message(module, attribute, fields, said):

@@ -80,7 +80,7 @@ class Mixture:
         is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
         require(is_weighted, "agents", "must have weights from 0, one above", got=self.weights)
         for agent in self.agents:
-            require_part("agent", Agent, agent, "Set agent=sejax.make_agent(config, task).")
+            require_part("agent", Agent, agent, "Use sejax.make_agent(config, task).")
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":

@@ -89,7 +89,7 @@ def policy_of(text: str, task: Task, agent_steps: int, key: Array) -> Actor:
 
 
 def _checked(act: Actor, task: Task) -> Actor:
-    """The policy, with checks of its actions."""
+    """The policy, with checks of its actions; continuous ones are clipped to their bounds."""
     count = task.num_actions
     expected = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
 

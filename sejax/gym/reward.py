@@ -18,7 +18,7 @@ from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import Header, check_tensors, configured, is_registered, read
 from sejax.proxies.reward import RewardConfig
 
-# Wrappers of observations that change no number, and all wrappers that change rewards.
+# Wrappers of observations that change no number, and wrappers that change rewards.
 SAME_NUMBERS = (wrappers.DtypeObservation, wrappers.FlattenObservation)
 OTHER_REWARDS = (gymnasium.RewardWrapper, wrappers.NormalizeReward, wrappers.MaxAndSkipObservation)
 GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` with another name there

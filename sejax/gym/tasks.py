@@ -1,6 +1,5 @@
 """The real tasks behind proxies, as Gymnasium has them."""
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,7 +44,7 @@ class RealTask:
       action_space: a `Discrete`, or a `Box` of vectors.
       max_steps: steps after which an episode is truncated, if the SE has no horizon of its own.
       starts: draws the first observation of an episode with a generator. The environment can be
-        pickled only if it can. None if the SE has learned its initial states.
+        pickled only if it can. Only an SE that begins in states of the task has them.
     """
 
     observation_space: spaces.Space[Any]
@@ -63,18 +62,19 @@ class RealTask:
     def of_env(cls, env: Env) -> "RealTask":
         """A task given as an environment that `gymnasium.make` has made with a step limit.
 
-        A copy of it draws the starts.
+        The SE resets it, with a generator of its own: do not use it for anything else.
 
         Raises:
           ConfigError: if it has no such limit.
         """
         limit = env.spec.max_episode_steps if env.spec else None
-        require(limit, "task", "must have a step limit", got=env, fix="Set max_steps.")
+        fix = "Make it with gymnasium.make(ID, max_episode_steps=N)."
+        require(limit, "task", "must have a step limit", got=env, fix=fix)
         return cls(
             observation_space=env.observation_space,
             action_space=env.action_space,
             max_steps=int(limit or 0),
-            starts=partial(_first_observation, copy.deepcopy(env)),
+            starts=partial(_first_observation, env),
         )
 
 

@@ -22,6 +22,7 @@ step                               its score
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 # Count of numbers, their mean, and the sum of squared differences from it.
@@ -39,7 +40,7 @@ def is_tie(scores: Float[Array, "*n"], other: Float[Array, ""]) -> Bool[Array, "
     return jnp.abs(scores - other) <= _TIE * jnp.maximum(1.0, jnp.abs(other))
 
 
-def reaches(score: Array | float, goal: float) -> Any:
+def reaches(score: Array | np.ndarray | float, goal: float) -> Any:
     """Whether scores, `[*n]` of any library, reach a goal, but for rounding.
 
     None reaches infinity, which stands for a task without a solved score.

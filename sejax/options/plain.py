@@ -175,8 +175,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
         return ConfigError(field, "is no field", fix=f"Set {old.INSTEAD[field]}.")
     last = field.rpartition(".")[2]
     field = shortened(field, 40)
-    usual = SYMBOLS.get(last, last)
-    same = [name for name in known if name.rpartition(".")[2] == usual]
+    same = [name for name in known if name.rpartition(".")[2] == SYMBOLS.get(last, last)]
     close = same or get_close_matches(field, known, 1, 0.7)
     fix = f"Did you mean {close[0]}? " if close else ""
     fix += f"Fields: {listed(same or nearest(field, known))}."

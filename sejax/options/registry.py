@@ -24,7 +24,6 @@ imported only if the user has typed it too.
 `sejax.options.plain` makes configurations of plain values, and writes them.
 """
 
-import contextlib
 import copy
 import dataclasses
 import functools
@@ -175,14 +174,10 @@ def find(group: str, name: str) -> Any:
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
     base = resolve_name(GROUPS[group].base)
-    arguments = GROUPS[group].arguments
-    is_fit = False
-    with contextlib.suppress(AttributeError, TypeError):  # there is no such `make`
-        inspect.signature(plugin.make).bind("self", *arguments)
-        is_class = isinstance(plugin, type) and issubclass(plugin, base)
-        is_fit = is_class and dataclasses.is_dataclass(plugin)
-    rule = f"must name a function, or a dataclass with make({', '.join(arguments)})"
-    rule += f" that derives from {base.__module__}.{base.__name__}" if base is not object else ""
+    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
+    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
+    rule = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
+    rule += f" that derives from {base.__module__}.{base.__name__}"
     require(is_fit, group, rule, got=f"{shortened(name, 40)}, which is {plugin}")
     # A registered class may serve several names, and then has such a field.
     is_free = path is not None or "name" not in plugin.__dataclass_fields__

@@ -120,9 +120,11 @@ def help_texts(cls: type) -> dict[str, str]:
     """The texts of attributes by name, from the docstrings of a class, its bases, or a function."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
-        rest = re.split("(?:Attributes|Args):\n", inspect.cleandoc(base.__doc__ or ""))[-1]
-        section = re.split(r"\n\n(?=\S)", rest)[0]
-        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", section, re.MULTILINE)
+        doc = inspect.cleandoc(base.__doc__ or "")
+        sections = "".join(
+            re.findall(r"^(?:Attributes|Args):\n((?:  .*\n?|\n)*)", doc, re.MULTILINE)
+        )
+        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", sections, re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
     return texts
 

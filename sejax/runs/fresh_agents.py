@@ -188,8 +188,12 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
         proxy_config = configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
     proxy = load_proxy(path, task, proxy_config, "proxy")
     own = str(stored["env"].get("name"))
-    is_same = config.env in (None, proxy.task.name, own) or own.endswith(header.BY_HAND)
-    require(is_same, "env", "must be the proxy's own task", got=config.env, use=own)
+    if task is not None and own.endswith(header.BY_HAND):
+        print(f"{path.name} does not say how its task was made: {config.env} stands for it.")
+        return proxy
+    is_same = config.env in (None, proxy.task.name, own)
+    use = "MODULE:NAME" if own.endswith(header.BY_HAND) else own
+    require(is_same, "env", "must be the proxy's own task", got=config.env, use=use)
     return proxy
 
 

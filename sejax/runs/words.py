@@ -195,8 +195,7 @@ def by_agent(tree: Tree, keys: Iterable[str]) -> Tree:
       {'agents': {'ddqn': {'tau': '1'}, 'td3': {'tau': '0.1'}}}
     """
     others = {name: x for name, x in tree.items() if name != "agent"}
-    of_all = dict.fromkeys(keys, tree.get("agent", {}))
-    return others | {"agents": merge(of_all, tree["agents"])}
+    return others | {"agents": merge(dict.fromkeys(keys, tree.get("agent", {})), tree["agents"])}
 
 
 def typed_name(name: str, keys: Collection[str]) -> str:
