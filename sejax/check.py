@@ -356,7 +356,8 @@ def _judgements(table: pd.DataFrame, learned: list[str], proxy: Proxy) -> dict[s
 def _cost(proxy: Proxy, summary: pd.DataFrame) -> dict[str, Any]:
     """What learning the proxy cost, and how many agents must train on it to save its real steps.
 
-    "never" if agents trained on the proxy do not reach the solved score.
+    "never" if agents trained on the proxy do not reach the solved score. On the task the agents
+    with fewer steps count, of those that reach it if any do.
     """
     learning = zoo.describe(header.read(proxy.path)).learning
     record: dict[str, Any] = vars(learning) if learning else {}  # of the file, else run.json

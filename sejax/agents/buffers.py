@@ -193,7 +193,8 @@ def write_row(
     capacity = rows.shape[0]
     if active is True:
         return jax.lax.dynamic_update_slice(rows, row[None], (step % capacity, 0))
-    return rows.at[jnp.where(active, step % capacity, capacity)].set(row, mode="drop")
+    index = jnp.where(active, step % capacity, capacity)
+    return rows.at[index].set(row, mode="drop")
 
 
 # --- sampling ------------------------------------------------------------------------------------

@@ -25,8 +25,8 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 # A caller must give the parts that no file can name: by group, the arguments of `sejax.load`, and
 # the words of a command.
 PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
-BY_HAND = ", made by hand"  # ends the name of a task that no name makes again
 PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
+BY_HAND = ", made by hand"  # ends the name of a task that no name makes again
 KIND = "sejax"  # name of the metadata's entry
 
 

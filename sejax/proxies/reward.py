@@ -239,7 +239,8 @@ class RewardEnv(ProxyEnv):
                 is_cut = self.is_truncated(next_state, params)
                 bonus = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, bonus)
         if self.config.shaping.is_potential_based:
-            bonus = params.discount * bonus - self.potential(params, state.obs, state.augmentation)
+            before = self.potential(params, state.obs, state.augmentation)
+            bonus = params.discount * bonus - before
         reward = real_reward + bonus if self.config.shaping.is_additive else bonus
         is_sane = jnp.isfinite(reward) & (jnp.abs(bonus) < MAX_ABS_VALUE)
         discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))

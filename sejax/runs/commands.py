@@ -121,10 +121,8 @@ def help_texts(cls: type) -> dict[str, str]:
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         doc = inspect.cleandoc(base.__doc__ or "")
-        sections = "".join(
-            re.findall(r"^(?:Attributes|Args):\n((?:  .*\n?|\n)*)", doc, re.MULTILINE)
-        )
-        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", sections, re.MULTILINE)
+        sections = re.findall(r"^(?:Attributes|Args):\n((?:  .*\n?|\n)*)", doc, re.MULTILINE)
+        entries = re.findall(r"^  (\w+): (.*(?:\n    .*)*)", "".join(sections), re.MULTILINE)
         texts |= {name: " ".join(text.split()) for name, text in entries}
     return texts
 

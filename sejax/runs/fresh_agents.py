@@ -187,12 +187,12 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     if config.proxy_kind is not None:
         proxy_config = configure("proxy", {**stored["proxy"], "name": config.proxy_kind})
     proxy = load_proxy(path, task, proxy_config, "proxy")
-    own = str(stored["env"].get("name"))
-    if task is not None and own.endswith(header.BY_HAND):
+    stored_name = str(stored["env"].get("name"))
+    is_by_hand = stored_name.endswith(header.BY_HAND)
+    if is_by_hand and task is not None:
         print(f"{path.name} does not say how its task was made: {config.env} stands for it.")
-        return proxy
-    is_same = config.env in (None, proxy.task.name, own)
-    use = "MODULE:NAME" if own.endswith(header.BY_HAND) else own
+    is_same = (is_by_hand and task) or config.env in (None, proxy.task.name, stored_name)
+    use = "MODULE:NAME" if is_by_hand else stored_name
     require(is_same, "env", "must be the proxy's own task", got=config.env, use=use)
     return proxy
 
