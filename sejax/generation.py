@@ -65,18 +65,13 @@ class Layout:
         return self.strategy.num_candidates * self.strategy.num_evals
 
     @functools.cached_property
-    def candidate_trainings_of(self) -> tuple[np.ndarray, ...]:
-        """For each agent, the numbers of its trainings on candidates, ascending."""
-        by_candidate = np.arange(self.num_on_candidates).reshape(-1, self.strategy.num_evals)
-        return tuple(by_candidate[candidates].ravel() for candidates in self.candidates_of)
-
-    @functools.cached_property
     def trainings_of(self) -> tuple[np.ndarray, ...]:
         """For each agent, the numbers of all its trainings, ascending; see the table above."""
+        by_candidate = np.arange(self.num_on_candidates).reshape(-1, self.strategy.num_evals)
         on_incumbent = self.num_on_candidates + np.arange(self.num_on_incumbent)
         turns = on_incumbent.reshape(-1, self.mixture.size).T  # [agent, turn]
-        pairs = zip(self.candidate_trainings_of, turns, strict=True)
-        return tuple(np.concatenate(pair) for pair in pairs)
+        pairs = zip(self.candidates_of, turns, strict=True)
+        return tuple(np.append(by_candidate[candidates], turn) for candidates, turn in pairs)
 
     def keys(self, key: Array) -> Array:
         """A key for each training of a generation, `[training]`, from the generation's key."""

@@ -144,10 +144,9 @@ class Scoring:
         """
         population, incumbent = jnp.split(of_trainings, [self.layout.num_on_candidates])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
-        pairs = zip(turns, self.layout.candidate_trainings_of, strict=True)
-        by_agent = [with_diverged_last(scores, population[numbers]) for scores, numbers in pairs]
-        incumbent = jnp.stack([repaired for repaired, _ in by_agent])  # [agent, turn]
-        agent_means = jnp.stack([mean for _, mean in by_agent])
+        pairs = zip(turns, self._of_agents(population), strict=True)
+        by_agent = [with_diverged_last(scores, mine) for scores, mine in pairs]
+        incumbent, agent_means = map(jnp.stack, zip(*by_agent, strict=True))  # [agent, *turn]
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(
             population=population,
@@ -160,11 +159,15 @@ class Scoring:
     def _by_agent(
         self, statistic: Callable[[Array], Array], values: Shaped[Array, " training"]
     ) -> Shaped[Array, " agent"]:
-        """A statistic of each agent's trainings; `values` may lack those on the incumbent.
+        """A statistic of each agent's trainings."""
+        return jnp.stack([*map(statistic, self._of_agents(values))])
+
+    def _of_agents(self, values: Shaped[Array, " training"]) -> list[Shaped[Array, " of_agent"]]:
+        """The values of each agent's trainings; `values` may lack those on the incumbent.
 
         These are numbered last. So their numbers lie beyond values that lack them, and drop out.
         """
-        return jnp.stack([statistic(values[x[x < values.size]]) for x in self.layout.trainings_of])
+        return [values[x[x < values.size]] for x in self.layout.trainings_of]
 
 
 def with_diverged_last(

@@ -239,8 +239,7 @@ def copy(task: Task, teacher: Teacher, num_states: int, widen: float) -> Copied:
     if np.isinf(widen):
         config: Any = sejax.config([f"env={task.name}"]).proxy
         space: Any = task.observation
-        units = config.units(space.low, space.high)
-        states = noise if units is None else units.decode(noise)
+        states = config.units(space.low, space.high).decode(noise)
     else:
         states = jnp.where(
             is_wide & (widen > 0), visited.mean(0) + widen * (noise * visited.std(0)), rows

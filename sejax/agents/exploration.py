@@ -293,9 +293,7 @@ def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
 
 def action_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
     """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
-    if action.ndim > 1:
-        return action
-    return (jnp.arange(width)[:, None] == action[None, :]).astype(jnp.float32)
+    return action if action.ndim > 1 else jax.nn.one_hot(action, width, axis=0)
 
 
 # --- counts --------------------------------------------------------------------------------------

@@ -4,13 +4,13 @@
 """
 
 from sejax.envs.base import Task as Task
-from sejax.envs.base import TaskConfig
 from sejax.envs.spec import Box as Box
 from sejax.envs.spec import Discrete as Discrete
 from sejax.envs.spec import TaskSpec as TaskSpec
 from sejax.envs.wrappers import with_one_done as with_one_done
 from sejax.options import registry
 from sejax.options.plain import configure, to_plain
+from sejax.options.registry import Makes
 
 
 def names() -> list[str]:
@@ -36,7 +36,7 @@ def make(name: str, **options: object) -> Task:
     return make_from(configure("env", {"name": name, **options}))
 
 
-def make_from(config: TaskConfig) -> Task:
+def make_from(config: Makes[Task]) -> Task:
     """The task that a configuration describes, built once; its `origin` is the configuration."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
@@ -44,7 +44,7 @@ def make_from(config: TaskConfig) -> Task:
     return task
 
 
-def spec_of(config: TaskConfig) -> TaskSpec:
+def spec_of(config: Makes[Task]) -> TaskSpec:
     """The spec that a task's configuration states, or else the task itself."""
     stated = getattr(config, "spec", None)
     return stated if isinstance(stated, TaskSpec) else make_from(config)

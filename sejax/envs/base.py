@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +12,6 @@ from sejax.envs.environment import Environment, EnvParams, spaces_of
 from sejax.envs.spec import Space, TaskSpec, sizes_of
 from sejax.envs.wrappers import as_vectors
 from sejax.options import ConfigError, Count, as_python, checked, require, shortened, told
-
-
-class TaskConfig(Protocol):
-    """A dataclass whose fields are a task's options; it may have the task's `spec`."""
-
-    def make(self) -> "Task": ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

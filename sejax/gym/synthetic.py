@@ -16,7 +16,7 @@ from sejax.gym.tasks import Info, RealTask
 from sejax.options import require, require_known
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.header import check_tensors
-from sejax.proxies.synthetic import SyntheticConfig
+from sejax.proxies.synthetic import SyntheticConfig, Units
 
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
@@ -54,7 +54,7 @@ class SyntheticWorld:
         self.observation_space = space = task.observation_space
         self.obs_dim = spaces.flatdim(space)
         action_dim = spaces.flatdim(task.action_space)
-        self._units = None
+        self._units = Units()
         if isinstance(space, spaces.Box):
             self._units = config.units(space.low, space.high)
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
@@ -84,8 +84,7 @@ class SyntheticWorld:
         vector = drawn
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
-        vector = vector if self._units is None else self._units.decode(vector)
-        return np.minimum(np.maximum(vector, -LIMIT), LIMIT)
+        return np.minimum(np.maximum(self._units.decode(vector), -LIMIT), LIMIT)
 
     def encode(self, action: ArrayLike, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
@@ -151,7 +150,7 @@ class SyntheticWorld:
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d; in a bandit the state stays, and d is 1."""
-        seen = vector if self._units is None else self._units.encode(vector)
+        seen = self._units.encode(vector)
         is_distance = self.config.reward_form != "network"
         inputs = seen if is_distance else np.concatenate([action, seen], axis=-1)
         outputs = networks.forward(self._layers, self.config.activation, inputs)
@@ -161,8 +160,7 @@ class SyntheticWorld:
         if self.config.is_bandit:
             done = np.ones_like(outputs)
             return np.concatenate([vector, outputs, done], axis=-1, dtype=np.float32)
-        if self._units is not None:
-            outputs[..., :-2] = self._units.decode(outputs[..., :-2])
+        outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
 
 

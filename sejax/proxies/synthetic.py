@@ -28,23 +28,23 @@ Vector = TypeVar("Vector", np.ndarray, Array)
 
 
 class Units(NamedTuple):
-    """Units in which an SE's networks see and make states.
+    """Units in which an SE's networks see and make states; by default the task's own.
 
     Attributes:
-      middle: `[obs_dim]` float32, the state that is 0 for the networks.
+      middle: `[obs_dim]` float32, the state that is 0 for the networks; None for the task's units.
       one: `[obs_dim]` float32, the difference that is 1 for them.
     """
 
-    middle: np.ndarray
-    one: np.ndarray
+    middle: np.ndarray | None = None
+    one: np.ndarray | float = 1.0
 
     def encode(self, vector: Vector) -> Vector:
         """States `[*batch, obs_dim]` in these units; of NumPy or JAX."""
-        return (vector - self.middle) / self.one
+        return vector if self.middle is None else (vector - self.middle) / self.one
 
     def decode(self, vector: Vector) -> Vector:
-        """Inverse of `encode`."""
-        return vector * self.one + self.middle
+        """Inverse of `encode`: states that networks or noise made, in the task's units."""
+        return vector if self.middle is None else vector * self.one + self.middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +131,8 @@ class SyntheticConfig(ProxyConfig):
             networks["start"] = [obs_dim, self.start_hidden_size, obs_dim]
         return networks
 
-    def units(self, low: ArrayLike, high: ArrayLike) -> Units | None:
-        """Units of states between two bounds; None for the task's own.
+    def units(self, low: ArrayLike, high: ArrayLike) -> Units:
+        """Units of states between two bounds.
 
         An entry without bounds keeps its own unit; some spaces write "none" as a huge number.
 
@@ -141,7 +141,7 @@ class SyntheticConfig(ProxyConfig):
           Units(middle=array([-0.5,  0. ], dtype=float32), one=array([0.5, 1. ], dtype=float32))
         """
         if self.state_units == "raw":
-            return None
+            return Units()
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
@@ -197,7 +197,7 @@ class SyntheticEnv(ProxyEnv):
     def __init__(self, task: Task, config: SyntheticConfig):
         super().__init__(task, config)
         self._networks = config.networks(task.obs_dim, task.action_dim)
-        self._units = None
+        self._units = Units()
         if isinstance(task.observation, Box):
             self._units = config.units(task.observation.low, task.observation.high)
             # Without the task's bounds: a learned state need not respect them.
@@ -226,21 +226,13 @@ class SyntheticEnv(ProxyEnv):
         inputs = self._inputs(vector, action)
         outputs = [self._apply(weights, name, inputs) for name in ("state", "reward", "done")]
         state, reward, done = outputs
-        return self._from_units(state), reward[0], done[0]
+        return self._units.decode(state), reward[0], done[0]
 
     def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
         """What the networks of a step see: the action, then the state in their units."""
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        return jnp.concatenate([action, self._to_units(vector)])
-
-    def _to_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
-        """A state in the networks' own units (`state_units`), as they see it."""
-        return vector if self._units is None else self._units.encode(vector)
-
-    def _from_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
-        """Inverse of `_to_units`: a state that networks or noise made, in the task's units."""
-        return vector if self._units is None else self._units.decode(vector)
+        return jnp.concatenate([action, self._units.encode(vector)])
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self.config.initial_state == "real":
@@ -252,7 +244,7 @@ class SyntheticEnv(ProxyEnv):
             if self.config.initial_state == "learned":
                 vector = noise + self._apply(params.weights, "start", noise)
             # Clipped to the limit, not beyond: a one-step SE, whose state stays, ends there.
-            vector = jnp.clip(self._from_units(vector), -MAX_ABS_VALUE, MAX_ABS_VALUE)
+            vector = jnp.clip(self._units.decode(vector), -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.observe(state), state
 
@@ -312,6 +304,6 @@ class BanditEnv(SyntheticEnv):
         if self.config.reward_form == "network":
             reward = self._apply(weights, "reward", self._inputs(vector, action))
             return vector, reward[0], jnp.float32(1)
-        best = self._apply(weights, "reward", self._to_units(vector))
+        best = self._apply(weights, "reward", self._units.encode(vector))
         difference = action - self.task.max_action * jnp.clip(best, -1.0, 1.0)
         return vector, -jnp.abs(difference).sum(), jnp.float32(1)

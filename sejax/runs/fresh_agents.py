@@ -87,20 +87,17 @@ class FreshAgentsConfig(CommandConfig):
         stored = stored_header(str(typed["proxy"]))
         learned = learned_layer(stored.config) if stored else {}
         drop_other_choices(learned, typed, ["exploration"])
-        as_learned: Tree = {"proxy": learned | {"agent_hparams": "as_learned"}}
         names = names_of(typed["agents"])
-        known: Tree = {}  # agents whose hyperparameters those of the same name take
-        match typed.get("agent_hparams"):
-            case "as_learned" if stored:
-                require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-                are_same = names in ({}, names_of(learned["agents"]))
-                fix = "Set agent_hparams=default."
-                require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
-                return as_learned
-            case None if learned and not names:
-                return as_learned
-            case None if learned:
-                known = learned["agents"]
+        asked = typed.get("agent_hparams")
+        if asked == "as_learned" and stored:
+            require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
+            are_same = names in ({}, names_of(learned["agents"]))
+            fix = "Set agent_hparams=default."
+            require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
+        if learned and (asked == "as_learned" or (asked is None and not names)):
+            return {"proxy": learned | {"agent_hparams": "as_learned"}}
+        # Agents of these names take the hyperparameters of the proxy's.
+        known = learned["agents"] if learned and asked is None else {}
         if not names:
             task = {"env": {"name": typed.get("env", "cartpole")}}
             name = agents.default_for(stored.spec) if stored else default_agent(task)

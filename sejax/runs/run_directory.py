@@ -20,7 +20,7 @@ from sejax.options.plain import differences
 from sejax.runs import runtime
 from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
-from sejax.scoring import GenerationInfo
+from sejax.scoring import AgentInfo, GenerationInfo
 
 COLUMNS = (
     *("generation", "seed", "incumbent_mean", "incumbent_std", "population_mean", "population_max"),
@@ -28,7 +28,7 @@ COLUMNS = (
     *("num_nonfinite", "env_steps_total", "wall_s"),
 )
 # Columns that a mixture also has for each agent, with the agent's name at the end.
-AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
+AGENT_COLUMNS = tuple(AgentInfo.__dataclass_fields__)
 
 _CHECKPOINT, _METRICS, _CONFIG = "checkpoint", "metrics.csv", "config.yaml"
 _STATE, _ROWS = "state", "metrics"  # names of the checkpoint's tensors begin so
