@@ -255,14 +255,14 @@ def test_every_step_in_a_grid_follows_its_map(name, rows, rewards):
         env, params = envs.make(name).env, envs.make(name).params
     next_index, reward, terminated = step_everywhere(env, params)
     assert next_index.shape == (len(rows) * len(rows[0]), 4)
-    for index in range(len(next_index)):
-        for action in range(4):
-            expected, cell = walk(rows, index, action)
-            assert next_index[index, action] == expected
-            assert reward[index, action] == np.float32(rewards[cell])
-            assert terminated[index, action] == (cell in "GO")
+    for index, action in np.ndindex(next_index.shape):
+        expected, cell = walk(rows, index, action)
+        assert next_index[index, action] == expected
+        assert reward[index, action] == np.float32(rewards[cell])
+        assert terminated[index, action] == (cell in "GO")
     obs, state = env.reset_env(KEY, params)
     assert obs == state.index == "".join(rows).index("S")
+    assert {refused(GridWorld, wrong) for wrong in (["S", " G"], ["  "], ["SX"])} == {"rows"}
 
 
 def test_the_move_into_the_goal_can_be_paid():

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.spec import Discrete, TaskSpec
-from sejax.options import Finite, Options
+from sejax.options import Finite, Options, require
 
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 CLIFF_WALKING = (*[" " * 12] * 3, "SOOOOOOOOOOG")
@@ -60,7 +60,13 @@ class GridWorld(Environment[GridState, GridParams]):
           rows: strings of equal length: one S where episodes start, G for goals, O for holes, # for
             walls and a space for floor.
           params: `default_params`; the defaults of `GridParams` if not given.
+
+        Raises:
+          ConfigError: for another map.
         """
+        is_map = len({*map(len, rows)}) == 1 and {*"".join(rows)} <= {*"SGO# "}
+        rule = "must be texts of one length, with one S, else G, O, # and spaces"
+        require(is_map and "".join(rows).count("S") == 1, "rows", rule, got=rows)
         cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._default_params = params or GridParams()
