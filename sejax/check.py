@@ -41,7 +41,7 @@ from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
 from sejax.proxies.io import Proxy
-from sejax.runs import commands, fresh_agents, plots, presets, runtime
+from sejax.runs import commands, fresh_agents, plots, presets
 from sejax.runs.chunks import Pool
 from sejax.runs.command_config import PLACES
 from sejax.runs.config import MachinesConfig
@@ -100,7 +100,6 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a proxy that cannot be judged.
       OSError: if a file cannot be written.
     """
-    runtime.configure_jax()
     findings(CheckConfig.of_words(overrides))
 
 

@@ -20,7 +20,7 @@ import pandas as pd
 from sejax.ops.files import as_file_name, require_writable, write_text
 from sejax.options import require
 from sejax.proxies import header, hub
-from sejax.runs import commands, fresh_agents, runtime
+from sejax.runs import commands, fresh_agents
 from sejax.runs.fresh_agents import FreshAgentsConfig, World
 
 
@@ -67,7 +67,6 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a proxy that cannot be loaded.
       OSError: if a file cannot be written.
     """
-    runtime.configure_jax()
     for config in EvaluateConfig.of_sweep(overrides):
         evaluate(config)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from sejax.bilevel import make_bilevel
 from sejax.options import FailedError
-from sejax.runs import commands, runtime, session
+from sejax.runs import commands, session
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import RunDirectory
@@ -59,7 +59,6 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
     for config in configs:
         with RunDirectory(config):
             pass
-    runtime.configure_jax()
     if len(by_program) > 1:
         for config, *_ in by_program.values():
             make_bilevel(**config.parts())

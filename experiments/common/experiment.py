@@ -22,7 +22,7 @@ from sejax import options
 from sejax.ops.files import write_bytes
 from sejax.options import Count, as_text, require, require_known, shortened
 from sejax.options.plain import from_plain, parsed
-from sejax.runs import commands, runtime
+from sejax.runs import commands
 from sejax.runs.words import texts_of
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
@@ -203,7 +203,6 @@ class Experiment:
 
     def _run_command(self, words: Sequence[str]) -> None:
         settings = self.settings.of(**parse(words))
-        runtime.configure_jax()
         try:
             self.run(settings)
         except KeyboardInterrupt:

@@ -32,7 +32,7 @@ from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact, require_vectors
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
-from sejax.runs import commands, runtime
+from sejax.runs import commands
 from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
@@ -124,9 +124,7 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for invalid overrides, or a folder of another command.
       OSError: if a file cannot be written.
     """
-    config = DistillConfig.of_words(overrides)
-    runtime.configure_jax()
-    distill(config, shlex.join(overrides))
+    distill(DistillConfig.of_words(overrides), shlex.join(overrides))
 
 
 help_text = functools.partial(commands.help_of, DistillConfig, __doc__)

@@ -164,18 +164,8 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
     require_vectors(task, task.name)
     agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
     shape = (task.action_dim, task.obs_dim + 1)
-    num_episodes = 2 * config.num_directions
     play, record_one = make_tester(agent, task, 1), make_recorder(agent, task, 1)
-
-    def episode(key: Array, policy: Policy, size: Array) -> tuple[Array, Array]:
-        """The return of an episode with an error of this size, and its steps."""
-        key_error, key_play = jax.random.split(key)
-        weights = policy.weights + size * random_map(key_error, shape)
-        tests = play(key_play, policy._replace(weights=weights))
-        return tests.returns[0], tests.num_steps[0]
-
     width = 1 if task.num_actions is None else None
-    spread = spread_over_devices(episode, num_devices=devices, cpu_num_parallel=width)
 
     def generation(key: Array, policy: Policy, number: Array | int) -> tuple[Policy, Array, Array]:
         key_directions, key_episodes, key_record = jax.random.split(key, 3)
@@ -183,12 +173,19 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
         weights = policy.weights + config.noise_std * jnp.concatenate([directions, -directions])
         # Both ways of a direction have the same initial state and error.
         keys = jnp.tile(jax.random.split(key_episodes, config.num_directions), 2)
-        tried = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_episodes, *x.shape)), policy)
         size = jnp.float32(config.policy_error)
         if task.num_actions is not None:  # only the outputs' relative size counts
             size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
-        sizes = jnp.broadcast_to(size, num_episodes)
-        returns, num_steps = spread(keys, tried._replace(weights=weights), sizes)
+
+        def episode(key: Array, weights: Array) -> tuple[Array, Array]:
+            """The return of an episode with these weights and an error, and its steps."""
+            key_error, key_play = jax.random.split(key)
+            weights = weights + size * random_map(key_error, shape)
+            tests = play(key_play, policy._replace(weights=weights))
+            return tests.returns[0], tests.num_steps[0]
+
+        spread = spread_over_devices(episode, num_devices=devices, cpu_num_parallel=width)
+        returns, num_steps = spread(keys, weights)
         plus, minus = jnp.split(or_lowest_finite(returns - config.alive_bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6

@@ -70,13 +70,14 @@ class EvosaxConfig(StrategyOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_known("es.name", self.name, ALGORITHMS)
+        _, antithetic, optimizer = ALGORITHMS[self.name]
         size = self.population_size
-        is_fit = size % 2 == 0 or not ALGORITHMS[self.name].antithetic
+        is_fit = size % 2 == 0 or not antithetic
         require(is_fit, "es.population_size", "must be even", got=size, use=size + 1)
-        algorithms_with = {"noise_std_decay": ["open_es"], "step_size": ["open_es", "pgpe"]}
-        for name, algorithms in algorithms_with.items():
+        has = {"noise_std_decay": self.name == "open_es", "step_size": optimizer == "adam"}
+        for name, has_it in has.items():
             value = getattr(self, name)
-            is_fit = self.name in algorithms or value == getattr(type(self), name)
+            is_fit = has_it or value == getattr(type(self), name)
             message = f"must be left out with es={self.name}, which has none; got {value}."
             require(is_fit, f"es.{name}", message)
 

@@ -50,8 +50,7 @@ def reaches(score: Array | np.ndarray | float, goal: float) -> Any:
 
 def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
     """Mean of the finite scores; nan if there is none."""
-    finite = jnp.isfinite(scores)
-    return jnp.where(finite, scores, 0.0).sum() / finite.sum()
+    return jnp.mean(scores, where=jnp.isfinite(scores))
 
 
 def or_minus_inf(scores: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -126,8 +126,8 @@ def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     full = {name: f"{where}.{name}".lstrip(".") for name in defaults}
     for name, value in values.items():
         if name in defaults:
-            field = _Field(full[name], defaults[name], marks(cls, name).get("plugin"))
-            fields[name] = _read(value, hints[name], field)
+            plugins = marks(cls, name).get("plugin")
+            fields[name] = _read(value, hints[name], full[name], defaults[name], plugins)
         elif not old.is_gone(f"{group}.{name}", value):
             raise unknown_field(f"{where}.{name}".lstrip("."), full.values())
     for name, default in defaults.items():
@@ -182,42 +182,34 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     return ConfigError(field, "is no field", fix=fix)
 
 
-class _Field(typing.NamedTuple):
-    """A field: its full name, its default, and its group if it holds plugins."""
+def _read(value: Any, hint: Any, name: str, default: Any, group: str | None) -> Any:
+    """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf.
 
-    name: str
-    default: Any
-    group: str | None
-
-
-def _read(value: Any, hint: Any, field: _Field) -> Any:
-    """A value as its field's type: values by key; a plugin; a dataclass; or a leaf."""
+    Args:
+      value: plain values.
+      hint: the type.
+      name: the field's full name, for messages.
+      default: the field's default.
+      group: of the plugins that the field holds; None if it holds none.
+    """
     of_key = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else Any
     if isinstance(value, Mapping) and of_key is not Any:
-        return _read_by_key(value, of_key, field)
-    if field.group:
-        if isinstance(value, Mapping) and field.default is not MISSING:
-            value = {"name": registry.name_of(field.group, field.default), **value}
-        return configure(field.group, value, field.name)
+        only = group if len(value) == 1 else None  # an only agent's fields are `agent.FIELD`
+        names = {key: only or f"{name}.{shortened(key, 40)}" for key in sorted(value, key=str)}
+        return {str(k): _read(value[k], of_key, names[k], MISSING, group) for k in names}
+    if group:
+        if isinstance(value, Mapping) and default is not MISSING:
+            value = {"name": registry.name_of(group, default), **value}
+        return configure(group, value, name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
-        rule = f"must have fields, as {field.name}.{next(iter(defaults_of(hint)), 'name')}"
-        require(isinstance(value, Mapping), field.name, rule, got=repr(value), fix="Leave it out.")
-        base = to_plain(field.default) if isinstance(field.default, hint) else {}
-        return from_plain(hint, base | value, field.name)
-    return _leaf(value, hint, field)
+        rule = f"must have fields, as {name}.{next(iter(defaults_of(hint)), 'name')}"
+        require(isinstance(value, Mapping), name, rule, got=repr(value), fix="Leave it out.")
+        base = to_plain(default) if isinstance(default, hint) else {}
+        return from_plain(hint, base | value, name)
+    return _leaf(value, hint, name, default)
 
 
-def _read_by_key(values: Mapping[Any, Any], hint: Any, field: _Field) -> dict[str, Any]:
-    """Values of one type by their keys, sorted."""
-    read = {}
-    for key in sorted(values, key=str):
-        is_only = len(values) == 1  # an only agent's fields are `agent.FIELD`
-        name = (field.group if is_only else None) or f"{field.name}.{shortened(key, 40)}"
-        read[str(key)] = _read(values[key], hint, field._replace(name=name, default=MISSING))
-    return read
-
-
-def _leaf(value: Any, hint: Any, field: _Field) -> Any:
+def _leaf(value: Any, hint: Any, name: str, default: Any) -> Any:
     """A number, a text or a list, which may stand as an override's text: read, or else as it is."""
     reading = value
     if isinstance(value, str):
@@ -226,8 +218,8 @@ def _leaf(value: Any, hint: Any, field: _Field) -> Any:
     elif type(value) in (int, float):
         value = str(value)  # it may be a name of digits, such as a folder's
     with suppress(ConfigError):
-        return checked(reading, hint, field.name, field.default)
-    return checked(value, hint, field.name, field.default)
+        return checked(reading, hint, name, default)
+    return checked(value, hint, name, default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

@@ -72,7 +72,7 @@ class Header:
         are_numbers = all(type(x) in (int, float) for x in numbers) and 0 <= self.discount <= 1
         np.array(numbers, float)  # OverflowError for one that is too large
         spec = self.spec
-        sizes = [spec.max_steps, *_sizes_of(spec.observation), *_sizes_of(spec.action)]
+        sizes = [spec.max_steps, _size_of(spec.observation), _size_of(spec.action)]
         are_counts = all(type(size) is int and 0 < size <= LARGEST for size in sizes)
         with np.errstate(over="ignore"):  # `spec` changes nan, and bounds beyond single precision
             is_same = spec.interface == self.interface
@@ -104,12 +104,10 @@ class Stored(NamedTuple):
     header: Header
 
 
-def _sizes_of(space: Space) -> list[int]:
-    """The counts in a space; 0 if a lower bound exceeds the upper one."""
-    if not isinstance(space, Box):
-        return [space.n]
-    is_ordered = all(low <= high for low, high in zip(space.low, space.high, strict=True))
-    return [space.size if is_ordered else 0]
+def _size_of(space: Space) -> int:
+    """The size of a space; 0 if a lower bound exceeds the upper one."""
+    bounds = zip(space.low, space.high, strict=True) if isinstance(space, Box) else ()
+    return space.size if all(low <= high for low, high in bounds) else 0
 
 
 def is_registered(group: str, stored: object) -> bool:

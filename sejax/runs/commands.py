@@ -63,6 +63,7 @@ def start(
             configs = (config.plain() for config in configs_of(overrides))
             print(yaml.safe_dump_all(configs, sort_keys=False), end="")
         else:
+            runtime.configure_jax()
             main(overrides)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from sejax.options import ConfigError, require_package, told
 from sejax.options.plain import to_plain
-from sejax.runs import commands, runtime
+from sejax.runs import commands
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -27,7 +27,6 @@ def main(overrides: Sequence[str]) -> None:
     from sejax.search import config, study
 
     plan = config.plan_of(overrides)
-    runtime.configure_jax()
     plan.default.task()  # raises if this machine cannot make it, before any trial is refused
     try:
         current = study.open_study(plan)
