@@ -176,6 +176,8 @@ def make_learner(
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
     `jax.jit` makes it one executable with the scan inside; `vmap` over keys makes several runs.
+    With `proxy = config.parts()["proxy"]` agents train on `proxy, proxy.params(result.weights)`,
+    and `sejax.save(path, proxy, result.weights)` keeps what was learned.
 
     Args:
       config: from `sejax.config`, with all parts and `generations`. What is for the command, such
@@ -198,9 +200,10 @@ def make_learner(
       (2,)
     """
     if config is not None:
-        if not callable(getattr(config, "parts", None)) or parts:
-            got = [*parts] or config
-            raise TypeError(f"config must be alone, of sejax.config([...]); got {got!r:.60}.")
+        if not callable(getattr(config, "parts", None)):
+            raise TypeError(f"config must be of sejax.config([...]); got {config!r:.60}.")
+        if parts:
+            raise TypeError(f"{', '.join(parts)} must be set in sejax.config([...]).")
         parts = config.parts()
         generations = config.generations if generations is None else generations
     generations = checked(100 if generations is None else generations, Count, "generations", 100)

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from sejax.agents.base import Agent, AgentSpec, AgentState, Hparams, require_agent
 from sejax.agents.buffers import no_buffer
 from sejax.agents.varied import for_keys
-from sejax.envs.base import Task
-from sejax.envs.environment import Environment
+from sejax.envs.base import Task, require_own_steps
+from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.spec import sizes_of
 from sejax.envs.wrappers import repeat_actions
 from sejax.objectives import Outcome
@@ -228,7 +228,8 @@ def make_evaluator(
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
-      test_env: as in `make_tester`, for the test after the training.
+      test_env: maps the task's environment to that of the test after the training. A test's
+        `scored_returns` add up its `info["scored_reward"]`.
       in_batches: as in `make_trainer`.
 
     Raises:
@@ -247,6 +248,9 @@ def make_evaluator(
       (10,)
     """
     require_part("task", Task, task, "Set task=env.task of a proxy, or sejax.envs.make(name).")
+    require_own_steps(env)
+    is_same = sizes_of(*spaces_of(env)) == sizes_of(task.observation, task.action)
+    require(is_same, "env", f"must have the spaces of {task.name}", fix="Set task=env.task.")
     require_agent(agent, task.observation, task.action)
     require_part("training", TrainingConfig, training)
     # A test of an agent that has not learned may last to the task's limit.
@@ -362,6 +366,21 @@ def evaluate_agents(
     agents must draw networks of the same sizes. Results equal those of
     `jax.vmap(make_evaluator(...))` up to rounding: programs of another width add in another order,
     and a training amplifies a difference in the last bit.
+
+    Not for code inside `jit` or `vmap`, which `make_evaluator` serves.
+
+    Args:
+      agent: from `sejax.make_agent`, or one of your own.
+      env: environment to train in, a proxy or the task's.
+      env_params: its params.
+      task: the real task.
+      training: stopping rule and limits.
+      keys: `[agent]`, as `jax.random.split(key, n)` makes them.
+      devices: the first ones are used; None for all.
+      num_parallel: agents side by side on a device; None for what suits agent and device.
+
+    Raises:
+      ConfigError: as `make_evaluator`, or for a single key.
     """
     shape = jax.random.key_data(keys).shape if hasattr(keys, "dtype") else ()
     require(len(shape) == 2, "keys", "must be several", use="jax.random.split(key, 20)")

@@ -24,7 +24,7 @@ UNKNOWN = (math.nan, math.nan)  # the interval of fewer values
 
 
 def mean_interval(values: ArrayLike) -> tuple[float, float]:
-    """Student's interval of the mean of independent values `[n]`; `UNKNOWN` if n < `ENOUGH`.
+    """Student's 95% interval of the mean of independent values `[n]`; (nan, nan) if n < 5.
 
     First average values that depend on each other, such as the agents that one proxy trained.
     """
@@ -59,6 +59,9 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
     - dynamics: they score above it by more, and above the others by more than the margin;
     - policy: they score above it by more, and above the others by less than the margin;
     - open: an interval contains the margin.
+
+    The margin is a tenth of what there is to learn, 0.1 (top - mean of floor). Intervals are at
+    95%.
 
     Args:
       myopic: scores of agents with a discount of 0, `[n]`.

@@ -102,7 +102,8 @@ def _checked(scores: Array, nonfinite: Bool[Array, "*agent"]) -> Float[Array, "*
     """
     scores = jnp.asarray(scores)
     shape = nonfinite.shape
-    require(scores.shape == shape, "objective", f"must give scores {shape}", got=scores.shape)
+    rule = f"must give one score for each agent, {shape}"
+    require(scores.shape == shape, "objective", rule, got=scores.shape)
     return jnp.where(nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 
 

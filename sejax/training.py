@@ -19,6 +19,7 @@ from sejax.agents.base import Agent, AgentState, Hparams, require_agent
 from sejax.agents.buffers import Buffer, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.environment import Environment, spaces_of
+from sejax.envs.spec import Discrete
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops import cpu
 from sejax.ops.keys import step_keys
@@ -35,7 +36,8 @@ from sejax.proxies.base import proxy_in, steps_are_real
 class TrainingConfig(Options):
     """How long an agent trains, and how it is tested.
 
-    The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`.
+    The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`; for
+    `make_trainer`, which plays no tests of its own, `solved_by="train"` too.
 
     Attributes:
       max_episodes: n_e: most episodes of a training
@@ -206,8 +208,9 @@ def make_trainer(
         `info["discount"]` says: with 1 minus the done network's output if `proxy.done=soft`, as in
         the authors' code.
       solved_reward: for `stop_rule="solved"`.
-      test_fn: plays tests on the real task; called after each training episode if
-        `training.tests_after_each` is not 0.
+      test_fn: plays tests on the real task, `(key, agent_state, active) -> (mean return, steps)`,
+        each `[]`; called after each training episode if `training.tests_after_each` is not 0.
+        `active` is False for an agent whose result is not read.
       keeps_stored: whether the result has what the agent's buffer holds at the end.
       in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
 
@@ -228,15 +231,20 @@ def make_trainer(
       >>> result.returns.shape
       (8, 20)
     """
+    require_part("agent", Agent, agent, "Write make_trainer(agent, env).")
     require_own_steps(env)
     require_agent(agent, *spaces_of(env))
     fix = "sejax.make_evaluator draws others."
     require(agent.varied is None, "agent", "must have fixed hyperparameters", fix=fix)
     require_part("training", TrainingConfig, training)
     can_stop = training.stop_rule != "solved" or math.isfinite(solved_reward)
-    require(can_stop, "solved_reward", "must be finite with stop_rule=solved", got=solved_reward)
+    fix = "Set solved_reward=task.solved_reward."
+    rule = "must be finite with stop_rule=solved"
+    require(can_stop, "solved_reward", rule, got=solved_reward, fix=fix)
     require_modes()
-    require(test_fn or not training.tests_after_each, "test_fn", "must be given, to play tests.")
+    fix = "sejax.make_evaluator plays them; or set solved_by=train."
+    is_tester = test_fn or not training.tests_after_each
+    require(is_tester, "test_fn", "must be given, to play tests", fix=fix)
     test_fn = test_fn if training.tests_after_each else None
     # A curve of tests may end at either limit.
     if test_fn is None and (proxy := proxy_in(env)) is not None:
@@ -447,8 +455,12 @@ class _Loop:
         stored, curve = large
         keys = _StepKeys.of(consts.key, state.step)
         action = self.agent.act(keys.act, state.agent_state, state.obs, explore=True)
+        env_action = self.agent.env_action(action)
+        is_index = not jnp.issubdtype(jnp.result_type(env_action), jnp.floating)
+        is_fit = is_index or not isinstance(spaces_of(self.env)[1], Discrete)
+        require(is_fit, "agent.act", "must give an index on this task", got=env_action)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
-            keys.env, state.env_state, self.agent.env_action(action), consts.env_params
+            keys.env, state.env_state, env_action, consts.env_params
         )
         truncated = self.env.is_truncated(env_state, consts.env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)

@@ -115,7 +115,9 @@ class Agent:
 
     Attributes:
       init: `(key, hparams) -> state`.
-      act: `(key, state, obs, explore) -> action`, as the buffer keeps it.
+      act: `(key, state, obs, explore) -> action`, as the buffer keeps it. `explore` is a Python
+        bool, passed by its name. `obs` is `[obs_dim]` float32, or an index `[]` int32 on a task
+        with numbered states. A discrete action is an index `[]` int32.
       update: `(key, state, batch) -> state`; one learning step on a batch from `buffer`.
       buffer: how steps are kept, from `sejax.agents.buffers`.
       hparams: the default hyperparameters of `init`, a pytree of floats.

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
 from sejax.ops.keys import WEYL, murmur, unit_interval
+from sejax.options import require
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
 T = TypeVar("T")
@@ -98,7 +99,12 @@ BufferMaker = Callable[[Transition, int], Buffer]
 
 
 def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
-    """A ring of the last `buffer_size` steps, from which batches are drawn uniformly."""
+    """A ring of the last `buffer_size` steps, from which batches are drawn uniformly.
+
+    It keeps observations that are vectors. A batch is a feature-major `Transition`, whose columns
+    are `batch_size` rounded up to whole vectors of the CPU. Multiply losses by `weight`, which is
+    0 in columns beyond `batch_size` and the number 1.0 if there are none; divide by `batch_size`.
+    """
 
     def make(example: Transition, max_steps: int) -> Buffer:
         obs_dim, action_dim = _dims(example)
@@ -117,7 +123,10 @@ def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
 
 
 def rollout_buffer(length: int) -> BufferMaker:
-    """The last `length` steps in order, overwritten once the agent has learned from them."""
+    """The last `length` steps in order, overwritten once the agent has learned from them.
+
+    It keeps observations that are vectors. A batch is a `Rollout`.
+    """
 
     def make(example: Transition, max_steps: int) -> Buffer:
         shape = (length, row_width(*_dims(example)) + 1)
@@ -134,7 +143,7 @@ def rollout_buffer(length: int) -> BufferMaker:
 
 
 def no_buffer() -> BufferMaker:
-    """Keeps nothing: each learning step sees the step just made."""
+    """Keeps nothing: each learning step sees the step just made, a single `Transition`."""
 
     def make(example: Transition, max_steps: int) -> Buffer:
         return Buffer(
@@ -147,7 +156,13 @@ def no_buffer() -> BufferMaker:
 
 
 def _dims(example: Transition) -> tuple[int, int | None]:
-    """Length of an observation, and of an action unless it is an index."""
+    """Length of an observation, and of an action unless it is an index.
+
+    Raises:
+      ConfigError: for observations that are indices.
+    """
+    rule = "must be no_buffer() where observations are indices"
+    require(example.obs.ndim, "agent.buffer", rule)
     action_dim = example.action.shape[0] if example.action.ndim else None
     return example.obs.shape[0], action_dim
 

@@ -80,7 +80,8 @@ class Mixture:
         is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
         require(is_weighted, "agents", "must have weights from 0, one above", got=self.weights)
         for agent in self.agents:
-            require_part("agent", Agent, agent, "Use sejax.make_agent(config, task).")
+            fix = "Use sejax.make_agent(config, task); of several sejax.Mixture(agents=...)."
+            require_part("agent", Agent, agent, fix)
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":

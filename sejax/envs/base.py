@@ -63,6 +63,9 @@ class Task(TaskSpec):
         is_nan = type(solved_reward) in (int, float) and math.isnan(solved_reward)
         is_known = not is_nan and not isinstance(solved_reward, str | None)  # it may be traced
         require(is_known, "env.solved_reward", "must be a number", got=solved_reward, use="inf")
+        rule = "must be a gymnax 1.x environment, in JAX"
+        fix = "Write env, params = gymnax.make(...)." if isinstance(self.env, tuple) else ""
+        require(hasattr(self.env, "default_params"), "env", rule, got=self.env, fix=fix)
         try:
             params = self.env.default_params if self.params is None else self.params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
@@ -80,8 +83,7 @@ class Task(TaskSpec):
         except ConfigError:
             raise
         except Exception as error:  # whatever an environment raises
-            rule = f"must be a gymnax 1.x environment; {self.name} raised {told(error)}."
-            raise ConfigError("env", rule) from error
+            raise ConfigError("env", f"{rule}; {self.name} raised {told(error)}.") from error
         values = {"env": env, "params": params, "max_steps": max_steps}
         values |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(values)

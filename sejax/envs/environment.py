@@ -21,11 +21,18 @@ from sejax.options import ConfigError
 
 @struct.dataclass
 class EnvState:
+    """State of an episode; `Environment` has an example of a subclass.
+
+    A subclass has the decorator `flax.struct.dataclass` too, and is made by keywords.
+    """
+
     time: Array | int  # steps since the reset
 
 
 @struct.dataclass
 class EnvParams:
+    """What steps read besides the state; subclassed as `EnvState`, with a default for each."""
+
     max_steps_in_episode: Array | int = 1
 
 
@@ -47,6 +54,23 @@ class Environment(Generic[State, Params]):
     Attributes:
       spaces: of observations and actions; None in a wrapper, where the methods `observation_space`
         and `action_space` give them.
+
+    Example:
+      >>> import sejax
+      >>> @struct.dataclass
+      ... class Place(EnvState):
+      ...     x: Array
+      >>> class Reach(Environment):
+      ...     def start(self, key):
+      ...         return Place(time=0, x=jax.random.uniform(key))
+      ...     def observe(self, state):
+      ...         return state.x[None]
+      ...     def step_env(self, key, state, action, params):
+      ...         state = Place(time=state.time + 1, x=state.x + 0.1 * action[0])
+      ...         return self.after(state, -jnp.abs(state.x), params)
+      >>> spec = TaskSpec(observation=Box((-1.0,), (1.0,)), action=Box.symmetric(1.0), max_steps=50)
+      >>> sejax.Task.of(spec, name="reach", env=Reach(spec)).obs_dim
+      1
     """
 
     spaces: tuple[Space, Space] | None = None
@@ -67,15 +91,15 @@ class Environment(Generic[State, Params]):
 
     def start(self, key: Array) -> State:
         """First state of an episode."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{self.name} needs start, or reset_env")
 
     def step_env(self, key: Array, state: State, action: Array, params: Params) -> Step[State]:
         """`(obs, state, reward, terminated, info)` of one step; never resets."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{self.name} needs step_env")
 
     def observe(self, state: State) -> Array:
         """The observation of a state."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{self.name} needs observe, or reset_env")
 
     def is_terminated(self, state: State, params: Params) -> Bool[Array, ""]:
         """Whether a state is terminal; False if only a step can tell, or if no state is."""

@@ -33,6 +33,7 @@ class Box:
 
     @classmethod
     def symmetric(cls, *high: float) -> "Box":
+        """Vectors whose entries lie between minus and plus these bounds."""
         return cls(tuple(-x for x in high), high)
 
     @property

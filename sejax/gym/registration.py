@@ -35,6 +35,7 @@ def make(
     Raises:
       ConfigError: if the file is missing or damaged, if it holds several proxies or a proxy that is
         JAX code, or if its task is unknown.
+      gymnasium.error.Error: for an id that Gymnasium does not know.
 
     Example:
       >>> make("acrobot").observation_space.shape

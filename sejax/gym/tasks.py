@@ -138,7 +138,10 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     require(has_limit, "task", f"must have max_steps={limit}", got=task.max_steps)
     is_same = task.action_space == learned.action_space
     rule = f"must have actions of {learned.action_space}"
-    require(is_same, "task", rule, got=task.action_space, fix="Wrap it in RescaleAction.")
+    kinds = {type(task.action_space), type(learned.action_space)}
+    is_rescaled = kinds == {spaces.Box}
+    fix = "Wrap it in RescaleAction." if is_rescaled else "Leave it out, or give the proxy's own."
+    require(is_same, "task", rule, got=task.action_space, fix=fix)
     is_same = signature(task.observation_space) == signature(learned.observation_space)
     rule = f"must observe {shortened(learned.observation_space)}"
     require(is_same, "task", rule, got=task.observation_space)

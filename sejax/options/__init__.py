@@ -209,9 +209,9 @@ def option(default: Any, *, traced: bool = False, varied: str | None = None) -> 
     Args:
       default: its default.
       traced: whether it is a number that a compiled program can take as an argument, as with
-        `agent_hparams=varied`; else, and by default, it is a constant of the program. See
-        `sejax.agents.traced`.
-      varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
+        `agent_hparams=varied`; else, and by default, it is a constant of the program.
+      varied: how `agent_hparams=varied` draws it: `triple`, from a third of it to three times;
+        `one_more_or_less`; or `tenth_to_one`, from 0.1 to 1. None for never.
     """
     return dataclasses.field(default=default, metadata={"traced": traced, "varied": varied})
 

@@ -178,7 +178,7 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     same = [name for name in known if name.rpartition(".")[2] == SYMBOLS.get(last, last)]
     close = same or get_close_matches(field, known, 1, 0.7)
     fix = f"Did you mean {close[0]}? " if close else ""
-    fix += f"Fields: {listed(same or nearest(field, known))}."
+    fix += "" if len(same) == 1 else f"Fields: {listed(same or nearest(field, known))}."
     return ConfigError(field, "is no field", fix=fix)
 
 

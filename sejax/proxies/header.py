@@ -133,7 +133,8 @@ def configured(group: str, values: object, where: str) -> Any:
     argument = PLUGIN_ARGUMENTS.get(group, group)
     word = PLUGIN_WORDS.get(group, group)
     rule = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
-    text = shortened(name, 80) if ":" in str(name) else "MODULE:NAME"
+    is_path = ":" in str(name) and not str(name).startswith("__main__:")  # a script's own
+    text = shortened(name, 80) if is_path else "MODULE:NAME"
     fix = f"If you trust it, set {word}={text} in a command, or {argument}=... in Python."
     raise ConfigError(argument, rule, got=shortened(name, 40), fix=fix)
 

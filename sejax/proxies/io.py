@@ -252,7 +252,7 @@ def save(
     """Writes a proxy atomically.
 
     Args:
-      path: the file, `*.safetensors`.
+      path: the file, `*.safetensors`; its folder is made if there is none.
       env: the proxy.
       weights: in the form of its `init_weights`; kept as float32.
       config: configuration that it was learned with, nested plain values. Those of the task and

@@ -226,6 +226,8 @@ def push(
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
     stored = header.read(source, single=True)
+    repo = repo.removeprefix(hub.SCHEME)
+    require(repo.count("/") == 1, "repo", "must be USER/REPO on the Hub", got=repo)
     address = f"{hub.SCHEME}{repo}"
     require(hub.parse(address, "repo")[0] == repo, "repo", "must be USER/REPO on the Hub", got=repo)
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, license)

@@ -180,6 +180,9 @@ class LearnConfig(CommandConfig):
 def config(overrides: Sequence[str] = ()) -> LearnConfig:
     """The configuration of a run, from the words after `python -m sejax.run`.
 
+    Args:
+      overrides: a list of words, not one text.
+
     Raises:
       ConfigError: for an unknown group, choice or field, or a value out of range.
 
