@@ -60,9 +60,8 @@ def test_an_outcome_counts_training_and_tests():
 @pytest.mark.parametrize("source", ["cartpole", "cliff_walking-rn"])
 def test_agents_are_those_that_a_stored_proxy_was_learned_with(source):
     proxy = sejax.load_proxy(source)
-    agents = {
-        key: sejax.make_agent(config, proxy.task) for key, config in proxy.learned_agents().items()
-    }
+    learned = proxy.learned_agents().items()
+    agents = {key: sejax.make_agent(config, proxy.task) for key, config in learned}
     assert {key: sejax.agent_of(proxy.env, key) for key in agents} == agents
     assert sejax.agent_of(proxy) is next(iter(agents.values()))
     assert sejax.training_of(proxy.env) == sejax.training_of(proxy)
@@ -70,7 +69,7 @@ def test_agents_are_those_that_a_stored_proxy_was_learned_with(source):
     assert refused(sejax.agent_of, proxy.env.bare) == "proxy"
     assert refused(sejax.training_of, sejax.load_proxy("cartpole"), "ppo") == "agent"
     other, training = sejax.envs.make("acrobot"), sejax.training_of(proxy)
-    assert refused(sejax.make_evaluator, agents.popitem()[1], proxy.env, other, training) == "agent"
+    assert refused(sejax.make_evaluator, agents.popitem()[1], proxy.env, other, training) == "env"
 
 
 def test_equal_arguments_compile_once():

@@ -294,10 +294,10 @@ def test_an_episode_ends_where_the_tasks_own_does():
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cliff_walking"])
-def test_a_reward_network_steps_in_double_precision_too(task):
-    env = make_env(task)
-    with jax.enable_x64(True):
+def test_proxies_step_in_double_precision_too(task):
+    for config in (RewardConfig(), sejax.SyntheticConfig(horizon=None, initial_state="real")):
+        env = config.make(envs.make(task))
         params = env.params(env.init_weights(KEY))
-        _, state = env.reset(KEY, params)
-        out = jax.eval_shape(env.step, KEY, state, jnp.int32(0), params)
-    assert out[2].shape == ()
+        with jax.enable_x64(True):
+            out = jax.eval_shape(env.step, KEY, env.reset(KEY, params)[1], jnp.int32(0), params)
+        assert out[2].shape == ()

@@ -30,13 +30,8 @@ ENV = ScriptedEnv()
 
 
 def training(**fields):
-    scripted = {
-        "max_episodes": MAX_EPISODES,
-        "window": WINDOW,
-        "plateau_tolerance": TOLERANCE,
-        "time_limit_is_terminal": False,
-    }
-    return paper_training(**scripted | fields)
+    scripted = {"max_episodes": MAX_EPISODES, "window": WINDOW, "plateau_tolerance": TOLERANCE}
+    return paper_training(**scripted | {"time_limit_is_terminal": False} | fields)
 
 
 def scripted_test(key, agent_state, active):
@@ -456,12 +451,21 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     assert make_trainer(agent, task.env, config)  # whose params may allow any length
 
 
+def traced(agent, task, **parts):
+    """The shapes of a training by an agent some parts of which are replaced."""
+    train = make_trainer(dataclasses.replace(agent, **parts), task.env)
+    return jax.eval_shape(train, KEY, task.params)
+
+
 @pytest.mark.parametrize("make, field", [
-    (lambda agent, task: make_trainer(task.env, agent), "env"),
+    (lambda agent, task: make_trainer(task.env, agent), "agent"),
+    (lambda agent, task: make_trainer(agent, task), "env"),
     (lambda agent, task: make_trainer(agent, task.env, {"max_steps": 3}), "training"),
     (lambda x, task: make_trainer(x, task.env, training(stop_rule="solved")), "solved_reward"),
     (lambda agent, task: evaluation.make_evaluator(agent, task.env, task.env, training()), "task"),
     (lambda agent, task: jax.enable_x64(True)(make_trainer)(agent, task.env), "jax_enable_x64"),
+    (lambda agent, task: traced(agent, task, buffer=rollout_buffer(4)), "agent.buffer"),
+    (lambda x, task: traced(x, task, act=lambda *_, explore: jnp.float32(0)), "agent.act"),
 ])  # fmt: skip
 def test_arguments_of_other_kinds_are_refused(make, field):
     task = envs.make("gridworld_2x2")

@@ -95,11 +95,8 @@ def _checked(act: Actor, task: Task) -> Actor:
 
     def checked(obs: np.ndarray) -> np.ndarray:
         shape = (len(obs), task.action_dim) if count is None else (len(obs),)
-        try:
+        with options.foreign_code("policy", f"must act in {task.name}; it"):
             actions = np.asarray(act(obs), float)
-        except Exception as error:
-            fault = f"must act in {task.name}; it raised {options.told(error)}."
-            raise options.ConfigError("policy", fault) from error
         known = np.isfinite(actions) if count is None else np.isin(actions, np.arange(count))
         got = f"{list(actions.shape)}, such as {actions.ravel()[:3]}"
         is_fit = actions.shape == shape and known.all()

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from sejax.envs.environment import Environment, EnvParams, spaces_of
 from sejax.envs.spec import Space, TaskSpec, sizes_of
 from sejax.envs.wrappers import as_vectors
-from sejax.options import ConfigError, Count, as_python, checked, require, shortened, told
+from sejax.options import Count, as_python, checked, foreign_code, require, shortened
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,7 +66,7 @@ class Task(TaskSpec):
         rule = "must be a gymnax 1.x environment, in JAX"
         fix = "Write env, params = gymnax.make(...)." if isinstance(self.env, tuple) else ""
         require(hasattr(self.env, "default_params"), "env", rule, got=self.env, fix=fix)
-        try:
+        with foreign_code("env", f"{rule}; {self.name}"):
             params = self.env.default_params if self.params is None else self.params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = checked(limit, Count, "env.max_steps", 200)
@@ -80,10 +80,6 @@ class Task(TaskSpec):
             require(is_same, "env", "needs its own default_params", got=self.name)
             if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(env, params, self.name)  # takes seconds; the others have tests
-        except ConfigError:
-            raise
-        except Exception as error:  # whatever an environment raises
-            raise ConfigError("env", f"{rule}; {self.name} raised {told(error)}.") from error
         values = {"env": env, "params": params, "max_steps": max_steps}
         values |= {"observation": observation, "action": action, "solved_reward": solved_reward}
         vars(self).update(values)

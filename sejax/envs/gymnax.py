@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sejax.envs.base import Task
-from sejax.options import ConfigError, Count, Options, told, unknown_name
+from sejax.options import Count, Options, foreign_code, unknown_name
 
 PREFIX = "gymnax/"
 # Gymnasium's registry defines when these count as solved; it has no threshold for the others.
@@ -46,11 +46,9 @@ class GymnaxTask(Options):
         gymnax_id = self.name.removeprefix(PREFIX)
         if gymnax_id not in registered_envs:
             raise unknown_name("env", self.name, [PREFIX + x for x in registered_envs])
-        try:
+        # It raises for a data set that cannot be fetched.
+        with foreign_code("env", f"must be one that gymnax makes; {gymnax_id}"):
             env, params = gymnax.make(gymnax_id)
-        except Exception as error:  # such as a data set that cannot be fetched
-            rule = f"must be one that gymnax makes; {gymnax_id} raised {told(error)}."
-            raise ConfigError("env", rule) from error
         max_steps = self.max_steps or params.max_steps_in_episode
         solved_reward = self.solved_reward
         if solved_reward is None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sejax.ops.scores import below_all, is_tie, or_lowest_finite, or_minus_inf
-from sejax.options import ConfigError, registry, require, told
+from sejax.options import foreign_code, registry, require
 
 FIELD = "es.score_transform"
 PerCandidate = Float[Array, " pop"]
@@ -112,12 +112,9 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         return TRANSFORMS[choice]
     function = registry.imported(FIELD, choice) if isinstance(choice, str) else choice
     for scores in (np.arange(pop, dtype=np.float32), np.zeros(pop, np.float32)):
-        try:
-            with jax.ensure_compile_time_eval():
-                weights = np.asarray(jax.jit(function)(scores), float)
-        except Exception as error:
-            message = f"must take scores in jax; {choice} raised {told(error)}."
-            raise ConfigError(FIELD, message) from error
+        told = foreign_code(FIELD, f"must take scores in jax; {choice}")
+        with told, jax.ensure_compile_time_eval():
+            weights = np.asarray(jax.jit(function)(scores), float)
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
         rule = f"must give {pop} finite weights for {pop} scores"
         fix = f"Mend {choice}, or set {FIELD}=rank."

@@ -148,6 +148,22 @@ def shortened(value: object, length: int = 80) -> str:
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
 
 
+@contextlib.contextmanager
+def foreign_code(field: str, rule: str) -> Iterator[None]:
+    """Turns what code of others raises in the block into a `ConfigError` that tells it.
+
+    Args:
+      field: the field at fault.
+      rule: what the code must do, and its name, after which the message says "raised ...".
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:  # of any kind
+        raise ConfigError(field, f"{rule} raised {told(error)}.") from error
+
+
 def told(error: BaseException) -> str:
     """An error of other code on one line: its kind, its message, its place in a user's file."""
     line = place_of(error)

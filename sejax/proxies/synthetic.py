@@ -240,12 +240,12 @@ class SyntheticEnv(ProxyEnv):
             count = self.task.num_states
             vector = jnp.float32(vector) if count is None else jax.nn.one_hot(vector, count)
         else:
-            vector = noise = jax.random.normal(key, (self.task.obs_dim,))
+            vector = noise = jax.random.normal(key, (self.task.obs_dim,), jnp.float32)
             if self.config.initial_state == "learned":
                 vector = noise + self._apply(params.weights, "start", noise)
             # Clipped to the limit, not beyond: a one-step SE, whose state stays, ends there.
             vector = jnp.clip(self._units.decode(vector), -MAX_ABS_VALUE, MAX_ABS_VALUE)
-        state = SyntheticState(vector=vector, time=jnp.int32(0))
+        state = SyntheticState(vector=jnp.float32(vector), time=jnp.int32(0))
         return self.observe(state), state
 
     def step_env(
@@ -253,7 +253,7 @@ class SyntheticEnv(ProxyEnv):
     ) -> tuple[Array, SyntheticState, Array, Array, dict[Any, Any]]:
         if self.task.num_actions is None:  # the networks never learned beyond the bounds
             action = jnp.clip(action, -self.task.max_action, self.task.max_action)
-        vector, reward, done = self.predict(params.weights, state.vector, action)
+        vector, reward, done = map(jnp.float32, self.predict(params.weights, state.vector, action))
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
         is_sane = size < MAX_ABS_VALUE  # False for nan
         state = SyntheticState(vector=jnp.where(is_sane, vector, state.vector), time=state.time + 1)

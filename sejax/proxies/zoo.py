@@ -226,10 +226,10 @@ def push(
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
     stored = header.read(source, single=True)
-    repo = repo.removeprefix(hub.SCHEME)
-    require(repo.count("/") == 1, "repo", "must be USER/REPO on the Hub", got=repo)
+    rule = "must be USER/REPO on the Hub"
+    require(str(repo).count("/") == 1, "repo", rule, got=repo)
     address = f"{hub.SCHEME}{repo}"
-    require(hub.parse(address, "repo")[0] == repo, "repo", "must be USER/REPO on the Hub", got=repo)
+    require(hub.parse(address, "repo")[0] == repo, "repo", rule, got=repo)
     card = card_of(describe(stored, repo.rpartition("/")[2]), address, license)
     with hub.explained("repo", repo):
         from huggingface_hub import CommitOperationAdd, HfApi
