@@ -209,8 +209,8 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("batch_size=3", "batch_size", "agent.batch_size"), ("=1", "an override", ""),
     ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),
     ("env.goal_reward=-1", "env.goal_reward", "env=cliff_walking"),
-    ("foo", "an override", "env="), ("generations.x=1", "generations", "got {'x': '1'}"),
-    ("agents=[ddqn,ppo", "agents", "in brackets"),
+    ("acrobot", "an override", "env="), ("generations = 3", "an override", "generations=VALUE"),
+    ("generations.x=1", "generations", "{'x': '1'}"), ("agent.torso=conv", "agent.torso", ""),
     ("es.score_transform=my_rank", "es.score_transform", "Set es.score_transform=rank."),
     ("es.score_transform=rank.py:f", "es.score_transform", "es.score_transform=rank:f."),
     ("agent=no_module_of:mine", "agent", "PYTHONPATH"), (f"agent=a:{'d' * 5000}", "agent", ""),
@@ -234,7 +234,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agent=ppo proxy.horizon=null training.max_steps=100", "training.max_steps", "max_steps=512"),
     ("es=open_es es.population_size=3", "es.population_size", "es.population_size=4"),
     ("num_seeds=4", "num_seeds", "seed=0,1,2"), ("es.mirrored=yes", "es.mirrored", "be true or "),
-    ("es.sigma=0.1", "es.sigma", "es.noise_std?"), ("agent.torso=conv", "agent.torso", ""),
+    ("es.sigma=0.1", "es.sigma", "noise_std?"), ("agents=[ddqn,ppo", "agents", "in brackets"),
 ])  # fmt: skip
 def test_bad_input_is_one_message_that_names_the_field_and_says_what_to_type(
     override, field, suggested

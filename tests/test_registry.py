@@ -276,7 +276,7 @@ def test_the_same_parts_as_objects_are_the_same_program(own):
         return re.sub(r"0x[0-9a-f]+", "", str(jax.make_jaxpr(learn)(jax.random.key(0))))
 
     assert program(by_objects) == program(sejax.make_learner(own))
-    with pytest.raises(TypeError, match="alone"):
+    with pytest.raises(TypeError, match="must be set"):
         sejax.make_learner(own, devices=1)
 
 
