@@ -28,7 +28,7 @@ THREE = ("min_generations=1", "max_generations=3")
 
 
 class Learning:
-    """Stands in for `study.learning`: scores of 100 noise_std + generation, kept in a file.
+    """Stands in for `study.make_run`: scores of 100 noise_std + generation, kept in a file.
 
     Attributes:
       ran: trial and generation of all that was computed.
@@ -60,7 +60,7 @@ class Learning:
 @pytest.fixture
 def learning(monkeypatch):
     fake = Learning()
-    monkeypatch.setattr(study, "learning", fake)
+    monkeypatch.setattr(study, "make_run", fake)
     return fake
 
 
@@ -272,8 +272,8 @@ GRID = (
 def test_trials_are_runs_of_the_command(tmp_path):
     search = search_config.plan_of([*GRID, "es.noise_std=0.1,0.2", "max_generations=3", "seeds=2"])
     overrides = ["es.noise_std=0.2", "agent.learning_rate=0.5"]
-    run = study.learning(search.trial_config(overrides), tmp_path / "trial", range(2))
-    study.learning(search.trial_config(overrides), tmp_path / "trial/seed0", range(1))(2)
+    run = study.make_run(search.trial_config(overrides), tmp_path / "trial", range(2))
+    study.make_run(search.trial_config(overrides), tmp_path / "trial/seed0", range(1))(2)
     assert run(1).scores.shape == (1,)  # one of both was ahead, as after a kill
     progress = run(3)
     assert progress.scores.shape == (3,) and progress.generations == 3

@@ -36,7 +36,7 @@ from sejax.runs import commands
 from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.config import LearnConfig, env_in
 from sejax.runs.store import Store
-from sejax.runs.words import Tree, names_of
+from sejax.runs.words import Tree, agent_names
 from sejax.training import TrainingConfig
 
 # How many steps students train by default, by kind of actions.
@@ -96,7 +96,7 @@ class DistillConfig(CommandConfig):
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
         env = env_in(typed)
         actions = envs.spec_of(env).actions
-        if not names_of(typed["agents"]):
+        if not agent_names(typed["agents"]):
             students = {name: {"name": name} for name in agents.USUAL[actions]}
             typed = merge(typed, {"agents": students})
         # An episode of a one-step SE has one step.

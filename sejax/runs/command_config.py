@@ -175,7 +175,7 @@ class CommandConfig(Options, ABC):
             name = next(iter(flatten(unknown) or unknown))
             is_known = name.partition(".")[0] in registry.GROUPS
             require(not is_known, shortened(name, 40), "is of other commands. Leave it out.")
-            raise unknown_field(name, config.named(config.plain()))
+            raise unknown_field(name, config.in_words(config.plain()))
         return config
 
     @property
@@ -197,7 +197,7 @@ class CommandConfig(Options, ABC):
         """Nested plain values, as in `config.yaml`; `sejax.save` keeps them with a proxy."""
         return to_plain(self)  # type: ignore[no-any-return]
 
-    def named(self, tree: Tree) -> dict[str, Any]:
+    def in_words(self, tree: Tree) -> dict[str, Any]:
         """Nested plain values by their names in words; a choice's value is the plugin's name."""
         flat = {typed_name(name, self.agents): x for name, x in flatten(tree).items()}
         return {name.removesuffix(".name"): x for name, x in flat.items()}

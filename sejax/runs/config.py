@@ -20,7 +20,7 @@ from sejax.proxies import ProxyConfig
 from sejax.runs.command_config import PLACES, CommandConfig
 from sejax.runs.presets import chosen, preset_of
 from sejax.runs.trackers import Tracker
-from sejax.runs.words import Tree, names_of
+from sejax.runs.words import Tree, agent_names
 
 if TYPE_CHECKING:  # which imports this module
     from sejax.runs.chunks import Chunks, Pool
@@ -157,11 +157,11 @@ class LearnConfig(CommandConfig):
     @classmethod
     def default_layers(cls, typed: Tree) -> dict[str, Tree]:
         """The choice of agents, and the preset."""
-        agent_names = names_of(typed["agents"])
-        if not agent_names:
+        names = agent_names(typed["agents"])
+        if not names:
             default = default_agent(typed)
-            agent_names = {default: default}
-        of_agents = {"agents": {key: {"name": name} for key, name in agent_names.items()}}
+            names = {default: default}
+        of_agents = {"agents": {key: {"name": name} for key, name in names.items()}}
         preset = preset_of(merge(of_agents, typed))
         return {"default": of_agents, f"preset={preset['preset']}": preset}
 

@@ -18,7 +18,7 @@ from sejax.proxies import header
 from sejax.proxies.io import Proxy, load_proxy, training_of
 from sejax.runs.command_config import CommandConfig
 from sejax.runs.config import default_agent
-from sejax.runs.words import Tree, drop_other_choices, names_of
+from sejax.runs.words import Tree, agent_names, drop_other_choices
 from sejax.training import TrainingConfig
 
 # Training on the real task.
@@ -87,11 +87,11 @@ class FreshAgentsConfig(CommandConfig):
         stored = stored_header(str(typed["proxy"]))
         learned = learned_layer(stored.config) if stored else {}
         drop_other_choices(learned, typed, ["exploration"])
-        names = names_of(typed["agents"])
+        names = agent_names(typed["agents"])
         asked = typed.get("agent_hparams")
         if asked == "as_learned" and stored:
             require(learned, "agent_hparams", "must be left out, as this proxy has no agents.")
-            are_same = names in ({}, names_of(learned["agents"]))
+            are_same = names in ({}, agent_names(learned["agents"]))
             fix = "Set agent_hparams=default."
             require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and (asked == "as_learned" or (asked is None and not names)):

@@ -14,7 +14,7 @@ import yaml
 
 from sejax.options import registry, require_known
 from sejax.options.plain import merge
-from sejax.runs.words import Tree, names_of
+from sejax.runs.words import Tree, agent_names
 
 # The text of sejax's own preset files, by their stems.
 FILES = sorted(Path(__file__).parents[1].glob("presets/*.yaml"))
@@ -72,7 +72,7 @@ def preset_of(typed: Tree) -> Tree:
     default = {"objective": {"name": registry.find("proxy", proxy).default_objective}}
     objective = chosen(merge(default, section, typed), "objective")
     of_names = section.get("with_agent", {})
-    beside = {key: of_names.get(x, {}) for key, x in names_of(typed["agents"]).items()}
+    beside = {key: of_names.get(x, {}) for key, x in agent_names(typed["agents"]).items()}
     settings = merge(
         {key: x for key, x in section.items() if not key.startswith("with_")},
         section.get("with_es", {}).get(es, {}),

@@ -155,7 +155,7 @@ def chosen_agents(values: Mapping[str, Any]) -> Tree:
     return {registry.key_of(name): {"name": name} for name in known}
 
 
-def names_of(agents: Mapping[str, Any]) -> dict[str, str]:
+def agent_names(agents: Mapping[str, Any]) -> dict[str, str]:
     """The names of the chosen agents by their keys."""
     return {k: str(x["name"]) for k, x in agents.items() if isinstance(x, Mapping) and "name" in x}
 
@@ -168,14 +168,14 @@ def drop_replaced(file: Tree, typed: Tree, is_whole: bool) -> Tree:
       typed: the words' tree.
       is_whole: whether words choose all agents; `agents.KEY=ppo` chooses one.
     """
-    typed_names = names_of(typed["agents"])
+    typed_names = agent_names(typed["agents"])
     if not typed_names:
         return file
     if file["agents"]:
         file = by_agent(file, file["agents"])  # the file's `agent.FIELD` are of its own agents
     agents = file["agents"]
     keys = typed_names.keys() if is_whole else agents.keys() | typed_names.keys()
-    replaced = {k for k, name in names_of(agents).items() if typed_names.get(k, name) != name}
+    replaced = {k for k, name in agent_names(agents).items() if typed_names.get(k, name) != name}
     file["agents"] = {key: x for key, x in agents.items() if key in keys - replaced}
     mixture = file.pop("mixture", {})
     if mixture and len(keys) > 1:

@@ -145,11 +145,11 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     if plan.config.space is not None:
         by_key = default.agents.items()
         agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
-        typed = default.named(LearnConfig.layers_of(fixed)["typed"])
+        typed = default.in_words(LearnConfig.layers_of(fixed)["typed"])
         for name, dimension in spaces.preset(plan.config.space, agents).items():
             if name not in typed:
                 space.setdefault(name, dimension)
-    fields = default.named(default.plain())
+    fields = default.in_words(default.plain())
     if unknown := space.keys() - fields.keys():
         raise unknown_field(min(unknown), fields)
     for name, x in space.items():

@@ -67,7 +67,7 @@ def open_study(plan: StudyPlan) -> optuna.Study:
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
-            fields = plan.default.named(plan.default.plain())
+            fields = plan.default.in_words(plan.default.plain())
             first = {x.parameter: x.parameter_of(fields[name]) for name, x in plan.space.items()}
             if None not in first.values():
                 study.enqueue_trial(first, skip_if_exists=True)
@@ -95,7 +95,7 @@ class Progress(NamedTuple):
     is_over: bool
 
 
-def learning(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callable[[int], Progress]:
+def make_run(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callable[[int], Progress]:
     """Runs that learn proxies, a run directory each, by one executable.
 
     A score is the search mean's score, averaged over seeds. A run that has solved its task keeps
@@ -211,7 +211,7 @@ def _computed(trial: Trial, plan: StudyPlan) -> str:
     trial.set_user_attr("settings", settings)
     try:
         config = plan.trial_config(overrides)
-        run = learning(config, plan.folder / _name(trial.number), range(plan.config.seeds))
+        run = make_run(config, plan.folder / _name(trial.number), range(plan.config.seeds))
     except ConfigError as error:  # settings that cannot work together
         trial.set_user_attr("refused", str(error))
         study.tell(trial, state=TrialState.PRUNED)
@@ -280,7 +280,7 @@ def _tried_again(study: optuna.Study, plan: StudyPlan, number: int) -> dict[str,
     """
     config = plan.trial_config(plan.overrides(study.trials[number].params))
     fresh = range(plan.config.seeds, plan.config.seeds + plan.config.fresh_seeds)
-    run = learning(config, plan.folder / f"verified/{number:04d}", fresh)
+    run = make_run(config, plan.folder / f"verified/{number:04d}", fresh)
     progress = run(plan.config.max_generations)
     return {"verified": float(progress.scores[-1]), "verified_cost": progress.generations}
 
@@ -290,7 +290,7 @@ def write_best(overrides: Sequence[str], plan: StudyPlan) -> str:
     # A preset file of a run names its folder, which holds that run.
     words = [*plan.fixed, *overrides, *(["run_dir=null"] if plan.default.run_dir else [])]
     line = shlex.join(["python", "-m", "sejax.run", *words])
-    read = plan.default.named(LearnConfig.layers_of(words)["typed"])
+    read = plan.default.in_words(LearnConfig.layers_of(words)["typed"])
     settings = {name: parsed(x) if isinstance(x, str) else x for name, x in read.items()}
     text = yaml.safe_dump(settings, sort_keys=False)
     write_text(plan.folder / "best.txt", f"{line}\n")
