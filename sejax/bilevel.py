@@ -53,7 +53,7 @@ class LearnState(struct.PyTreeNode):
     generation: Array
     last: ScoredProxy  # the incumbent of the last generation, before its update
     best: ScoredProxy
-    solved: Array  # with stop_when_solved: the run is over; later generations train nothing
+    solved: Array  # `stop_when_solved` has ended the run: later generations train nothing
 
 
 class LearnResult(struct.PyTreeNode):
@@ -183,7 +183,9 @@ def make_learner(
       config: from `sejax.config`, with all parts and `generations`. What is for the command, such
         as `seed` and `run_dir`, has no effect here.
       generations: n_o of Algorithm 1; by default the configuration's, or 100.
-      **parts: arguments of `make_bilevel`: `task`, `agent`, and any others.
+      **parts: arguments of `make_bilevel`: `task`, `agent`, and any others. No preset applies to
+        them, and the proxy chooses none of the others: with a `RewardConfig` pass what the command
+        takes, such as `objective=RewardThreshold()`.
 
     Raises:
       ConfigError: if the parts do not fit each other, or there are too few devices.

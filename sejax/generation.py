@@ -51,8 +51,8 @@ class Layout:
         return -(-self.strategy.num_incumbent_evals // self.mixture.size) * self.mixture.size
 
     @functools.cached_property
-    def candidates_of(self) -> tuple[np.ndarray, ...]:
-        """For each agent, the numbers of the candidates that it trains on.
+    def candidate_indices(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the indices of the candidates that it trains on.
 
         Raises:
           ConfigError: if the population is too small for the mixture.
@@ -65,12 +65,12 @@ class Layout:
         return self.strategy.num_candidates * self.strategy.num_evals
 
     @functools.cached_property
-    def trainings_of(self) -> tuple[np.ndarray, ...]:
-        """For each agent, the numbers of all its trainings, ascending; see the table above."""
+    def training_indices(self) -> tuple[np.ndarray, ...]:
+        """For each agent, the indices of all its trainings, ascending; see the table above."""
         by_candidate = np.arange(self.num_on_candidates).reshape(-1, self.strategy.num_evals)
         on_incumbent = self.num_on_candidates + np.arange(self.num_on_incumbent)
         turns = on_incumbent.reshape(-1, self.mixture.size).T  # [agent, turn]
-        pairs = zip(self.candidates_of, turns, strict=True)
+        pairs = zip(self.candidate_indices, turns, strict=True)
         return tuple(np.append(by_candidate[candidates], turn) for candidates, turn in pairs)
 
     def keys(self, key: Array) -> Array:
@@ -178,15 +178,15 @@ class GenerationEvaluator:
         weights = jnp.concatenate([candidates.population, candidates.incumbent[None]])
         shared = candidates.active, candidates.test_params
 
-        def of_agent(numbers: np.ndarray) -> Trainings:
+        def of_agent(indices: np.ndarray) -> Trainings:
             # The incumbent's weights are the last.
-            rows = np.minimum(numbers // self._layout.strategy.num_evals, len(weights) - 1)
+            rows = np.minimum(indices // self._layout.strategy.num_evals, len(weights) - 1)
             active, test_params = jax.tree.map(
-                lambda x: jnp.broadcast_to(x, (numbers.size, *jnp.shape(x))), shared
+                lambda x: jnp.broadcast_to(x, (indices.size, *jnp.shape(x))), shared
             )
-            return Trainings(candidates.keys[numbers], weights[rows], active, test_params)
+            return Trainings(candidates.keys[indices], weights[rows], active, test_params)
 
-        return [of_agent(numbers) for numbers in self._layout.trainings_of]
+        return [of_agent(indices) for indices in self._layout.training_indices]
 
     def joined(self, by_agent: Sequence[Outcome]) -> Outcome:
         """The outcomes of all `trainings`: by candidate, and then by turn of the incumbent.
@@ -195,5 +195,5 @@ class GenerationEvaluator:
         """
         if len(by_agent) == 1:
             return by_agent[0]
-        order = np.argsort(np.concatenate(self._layout.trainings_of))
+        order = np.argsort(np.concatenate(self._layout.training_indices))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *by_agent)

@@ -98,7 +98,7 @@ class Scoring:
         aggregate = jnp.mean if layout.strategy.eval_aggregate == "mean" else jnp.min
         by_candidate = scores.population.reshape(-1, layout.strategy.num_evals)
         population = aggregate(by_candidate, axis=1)  # nan if the agent of one evaluation diverged
-        return layout.mixture.comparable(population, layout.candidates_of, scores.agent_means)
+        return layout.mixture.comparable(population, layout.candidate_indices, scores.agent_means)
 
     def shown_scores(self, outcome: Outcome) -> Scores:
         """The scores that people see, of all trainings."""
@@ -170,7 +170,7 @@ class Scoring:
 
         These are numbered last. So their numbers lie beyond values that lack them, and drop out.
         """
-        return [values[x[x < values.size]] for x in self.layout.trainings_of]
+        return [values[x[x < values.size]] for x in self.layout.training_indices]
 
 
 def with_diverged_last(

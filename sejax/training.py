@@ -42,7 +42,8 @@ class TrainingConfig(Options):
     Attributes:
       max_episodes: n_e: most episodes of a training
       min_steps: Training steps before the stop rule may end a training.
-      max_steps: Training ends after this many steps, whatever the stop rule says.
+      max_steps: Steps of a whole training, not of an episode; it ends then, whatever the stop rule
+        says.
       stop_rule: plateau (SEs), solved (real tasks), or never
       window: d: episodes in each of the two means that the plateau rule compares
       plateau_tolerance: C_diff: relative change between them that counts as flat
@@ -192,9 +193,10 @@ def make_trainer(
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams=None, active=True) -> TrainResult` for one agent.
 
-    `train` is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
-    agents takes as many steps as its longest training, without copies of replay buffers. With
-    `active=False` no step is taken.
+    `train` is pure; `vmap` it over keys, parameters and hyperparameters. On a GPU all agents then
+    step together, as long as the longest training. On a CPU `vmap` gives a `lax.map` over batches
+    of the width that suits the agent, often one. No replay buffer is copied. With `active=False` no
+    step is taken.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
@@ -212,7 +214,7 @@ def make_trainer(
         each `[]`; called after each training episode if `training.tests_after_each` is not 0.
         `active` is False for an agent whose result is not read.
       keeps_stored: whether the result has what the agent's buffer holds at the end.
-      in_batches: whether `vmap` on a CPU takes the fastest number of agents at a time.
+      in_batches: whether `vmap` on a CPU gives this `lax.map`; False for a plain `vmap`.
 
     Raises:
       ConfigError: for arguments of the wrong kind; if `training` has a fixed number of steps and

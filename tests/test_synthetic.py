@@ -184,7 +184,7 @@ def test_starts_of_noise_are_that_in_the_units_of_the_networks():
 def test_units_of_bounds_are_from_the_middle_with_half_of_the_way_as_one():
     """MountainCar: positions in [-1.2, 0.6], velocities in [-0.07, 0.07]."""
     env = make_env("mountain_car", state_units="bounds", done="threshold")
-    assert env.config.units([2.0], [2.0]).one == 1.0  # a number that is constant
+    assert env.config.units([2.0], [2.0]).scale == 1.0  # a number that is constant
     middle, one = np.array([-0.3, 0.0]), np.array([0.45, 0.035])
     obs, weights = np.array([0.2, -0.05]), env.init_weights(jax.random.key(3))
     seen = np.concatenate([[0, 1, 0], (obs - middle) / one])

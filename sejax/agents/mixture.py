@@ -97,7 +97,7 @@ class Mixture:
         return len(self.agents)
 
     def deal(self, num_candidates: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
-        """The candidates of each agent: their numbers in the population, ascending.
+        """The candidates of each agent: their indices in the population, ascending.
 
         Each candidate in turn goes to the agent that is furthest behind its share; an agent of
         weight 0 gets none. The two candidates of an antithetic pair are compared with each other,

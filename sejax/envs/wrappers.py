@@ -90,7 +90,7 @@ def repeat_actions(env: Environment, num_repeats: int) -> Environment:
 
 @struct.dataclass
 class PartState(EnvState):
-    world: EnvState  # the wrapped environment's
+    env_state: EnvState  # of the wrapped environment
 
 
 @struct.dataclass
@@ -115,8 +115,8 @@ class PartlyScored(Wrapper[PartState, PartParams]):
         self.params = params
 
     def reset_env(self, key: Array, params: PartParams) -> tuple[Array, PartState]:
-        obs, world = self.env.reset_env(key, self.params)
-        return obs, PartState(time=jnp.int32(0), world=world)
+        obs, env_state = self.env.reset_env(key, self.params)
+        return obs, PartState(time=jnp.int32(0), env_state=env_state)
 
     def step_env(
         self, key: Array, state: PartState, action: Array, params: PartParams
@@ -124,16 +124,16 @@ class PartlyScored(Wrapper[PartState, PartParams]):
         limit = self.params.max_steps_in_episode
         is_within = state.time < limit
         until = jnp.where(is_within, limit, self._longest(params))
-        obs, world, reward, terminated, info = self.env.step_env(
-            key, state.world, action, self._with_limit(until)
+        obs, env_state, reward, terminated, info = self.env.step_env(
+            key, state.env_state, action, self._with_limit(until)
         )
         scored = jnp.where(state.time < params.scored_steps, reward, 0.0)
-        state = PartState(time=state.time + info.get("sejax_num_steps", 1), world=world)
+        state = PartState(time=state.time + info.get("sejax_num_steps", 1), env_state=env_state)
         reward = jnp.where(is_within, reward, 0.0)
         return obs, state, reward, terminated, {**info, "scored_reward": scored}
 
     def is_truncated(self, state: PartState, params: PartParams) -> Array:
-        return self.env.is_truncated(state.world, self._with_limit(self._longest(params)))
+        return self.env.is_truncated(state.env_state, self._with_limit(self._longest(params)))
 
     def _longest(self, params: PartParams) -> Array:
         return jnp.maximum(self.params.max_steps_in_episode, params.scored_steps)

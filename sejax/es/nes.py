@@ -24,7 +24,7 @@ class NESConfig(StrategyOptions):
     The defaults were measured to work for SEs (docs/defaults.md); `preset=paper` has the paper's.
 
     Attributes:
-      population_size: n_p: perturbations of a generation
+      population_size: n_p: perturbations of a generation; if mirrored, two candidates each
       num_incumbent_evals: Agents on the search mean; null: one for each perturbation, as in the
         paper.
       noise_std: sigma: std of the weight perturbation
@@ -33,7 +33,8 @@ class NESConfig(StrategyOptions):
       step_size_decay: factor on alpha after each generation
       mirrored: each perturbation is tried as +eps and -eps and keeps its better sign
       score_transform: A name, or my_module:my_function that maps scores `[pop]` to weights `[pop]`.
-      update_rule: authors: psi += alpha sum F eps; paper: the same sum divided by n_p sigma
+      update_rule: authors: psi += alpha sum F eps, eps ~ N(0, sigma^2 I); paper: the same sum
+        divided by n_p sigma
       weight_decay: psi shrinks by this fraction before each update
     """
 
@@ -59,9 +60,9 @@ class NESConfig(StrategyOptions):
     def make(self, num_dims: int) -> Strategy:
         r"""NES over vectors `[num_dims]`.
 
-        The population is psi + eps_i for `population_size` perturbations, then psi - eps_i if
-        sampling is mirrored. A mirrored pair takes the score and the eps of its better sign; in a
-        tie, of the plus sign.
+        The population is psi + eps_i, eps_i ~ N(0, sigma^2 I), for `population_size` perturbations,
+        then psi - eps_i if sampling is mirrored. A mirrored pair takes the score and the eps of its
+        better sign; in a tie, of the plus sign.
 
         .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
 

@@ -19,6 +19,7 @@ from sejax.options import foreign_code, registry, require
 
 FIELD = "es.score_transform"
 PerCandidate = Float[Array, " pop"]
+# Those of this file take the scores, and the incumbent's; a user's take the scores alone.
 ScoreTransform = Callable[[PerCandidate, Float[Array, ""]], PerCandidate]
 OwnTransform = Callable[[PerCandidate], PerCandidate]
 

@@ -224,8 +224,8 @@ def option(default: Any, *, traced: bool = False, varied: str | None = None) -> 
 
     Args:
       default: its default.
-      traced: whether it is a number that a compiled program can take as an argument, as with
-        `agent_hparams=varied`; else, and by default, it is a constant of the program.
+      traced: whether it may be traced: a number that a compiled program can take as an argument, as
+        with `agent_hparams=varied`. Otherwise, and by default, it is a constant of the program.
       varied: how `agent_hparams=varied` draws it: `triple`, from a third of it to three times;
         `one_more_or_less`; or `tenth_to_one`, from 0.1 to 1. None for never.
     """

@@ -112,7 +112,7 @@ class RewardConfig(ProxyConfig):
 
 @struct.dataclass
 class RewardState(EnvState):
-    world: Any  # the real task's state
+    env_state: Any  # of the real task
     obs: Array  # what the agent saw last
     augmentation: Float[Array, " keys"]  # v of that state; zeros before the first step
 
@@ -219,18 +219,22 @@ class RewardEnv(ProxyEnv):
         return self.config.output_scale * outputs[0]
 
     def reset_env(self, key: Array, params: RewardParams) -> tuple[Array, RewardState]:
-        obs, world = self.task.env.reset_env(key, self.task.params)
+        obs, env_state = self.task.env.reset_env(key, self.task.params)
         nothing = jnp.zeros(len(self._augmented_keys), jnp.float32)
-        return obs, RewardState(world=world, obs=obs, augmentation=nothing, time=jnp.int32(0))
+        return obs, RewardState(
+            env_state=env_state, obs=obs, augmentation=nothing, time=jnp.int32(0)
+        )
 
     def step_env(
         self, key: Array, state: RewardState, action: Array, params: RewardParams
     ) -> tuple[Array, RewardState, Array, Array, dict[Any, Any]]:
-        obs, world, real_reward, terminated, info = self.task.env.step_env(
-            key, state.world, action, self.task.params
+        obs, env_state, real_reward, terminated, info = self.task.env.step_env(
+            key, state.env_state, action, self.task.params
         )
         vector = _select(info, self._augmented_keys)
-        next_state = RewardState(world=world, obs=obs, augmentation=vector, time=state.time + 1)
+        next_state = RewardState(
+            env_state=env_state, obs=obs, augmentation=vector, time=state.time + 1
+        )
         if self.config.shaping.weighs_info:
             bonus = params.weights["info_weights"] @ _select(info, self.task.info_keys)
         else:
@@ -254,7 +258,7 @@ class RewardEnv(ProxyEnv):
 
     def is_truncated(self, state: RewardState, params: RewardParams) -> Array:
         at_limit = state.time >= params.max_steps_in_episode
-        return at_limit | self.task.env.is_truncated(state.world, self.task.params)
+        return at_limit | self.task.env.is_truncated(state.env_state, self.task.params)
 
     def observe(self, state: RewardState) -> Array:
         return state.obs

@@ -31,20 +31,20 @@ class Units(NamedTuple):
     """Units in which an SE's networks see and make states; by default the task's own.
 
     Attributes:
-      middle: `[obs_dim]` float32, the state that is 0 for the networks; None for the task's units.
-      one: `[obs_dim]` float32, the difference that is 1 for them.
+      center: `[obs_dim]` float32, the state that is 0 for the networks; None for the task's units.
+      scale: `[obs_dim]` float32, the difference that is 1 for them.
     """
 
-    middle: np.ndarray | None = None
-    one: np.ndarray | float = 1.0
+    center: np.ndarray | None = None
+    scale: np.ndarray | float = 1.0
 
     def encode(self, vector: Vector) -> Vector:
         """States `[*batch, obs_dim]` in these units; of NumPy or JAX."""
-        return vector if self.middle is None else (vector - self.middle) / self.one
+        return vector if self.center is None else (vector - self.center) / self.scale
 
     def decode(self, vector: Vector) -> Vector:
         """Inverse of `encode`: states that networks or noise made, in the task's units."""
-        return vector if self.middle is None else vector * self.one + self.middle
+        return vector if self.center is None else vector * self.scale + self.center
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +58,8 @@ class SyntheticConfig(ProxyConfig):
       done: How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 -
         d (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1). With
         soft, agents outside of sejax do not see 1 - d.
-      min_steps: First step at which d may end an episode; before it, targets bootstrap with 1. If
-        episodes last a step or two, the SE is a one-step SE, whatever its networks could do.
+      min_steps: First step of an episode at which d may end it; targets before it bootstrap with
+        1. If episodes last a step or two, the SE is a one-step SE, whatever its networks could do.
       initial_state: real: the task's initial states; learned: standard normal noise plus a
         network's output for it; noise: noise alone, in the units of `state_units`.
       state_units: Units in which the networks see and make states. raw: the task's own; bounds: 0
@@ -138,16 +138,16 @@ class SyntheticConfig(ProxyConfig):
 
         Example:
           >>> SyntheticConfig(state_units="bounds").units([-1.5, -np.inf], [0.5, np.inf])
-          Units(middle=array([-0.5,  0. ], dtype=float32), one=array([0.5, 1. ], dtype=float32))
+          Units(center=array([-0.5,  0. ], dtype=float32), scale=array([0.5, 1. ], dtype=float32))
         """
         if self.state_units == "raw":
             return Units()
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
-        middle = (low + high) / 2
-        one = np.where(low < high, high - low, 4) / 4
-        return Units(middle.astype(np.float32), one.astype(np.float32))
+        center = (low + high) / 2
+        scale = np.where(low < high, high - low, 4) / 4
+        return Units(center.astype(np.float32), scale.astype(np.float32))
 
     def make(self, task: Task) -> "SyntheticEnv":
         """The SE of a task.

@@ -22,6 +22,7 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 from sejax.scoring import AgentInfo, GenerationInfo
 
+# `env_steps_total` counts steps on the real task, none in an SE.
 COLUMNS = (
     *("generation", "seed", "incumbent_mean", "incumbent_std", "population_mean", "population_max"),
     *("best_so_far", "train_steps_mean", "train_steps_max", "train_episodes_mean"),

@@ -41,8 +41,9 @@ def run(
       report: prints each generation; None: nothing is printed.
 
     Returns:
-      The content of `run.json`. `ended` is finished, solved, or diverged: no search mean had a
-      finite score, and there is no proxy. If all agents diverge, the run stops.
+      The content of `run.json`. `ended` is solved, by `stop_when_solved` alone; finished, all
+      generations, whatever the score; or diverged: no search mean had a finite score, and there is
+      no proxy. If all agents diverge, the run stops.
 
     Raises:
       ConfigError: if another version wrote the folder's state.
