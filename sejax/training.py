@@ -245,8 +245,7 @@ def make_trainer(
     require(can_stop, "solved_reward", rule, got=solved_reward, fix=fix)
     require_modes()
     fix = "sejax.make_evaluator plays them; or set solved_by=train."
-    is_tester = test_fn or not training.tests_after_each
-    require(is_tester, "test_fn", "must be given, to play tests", fix=fix)
+    require(test_fn or not training.tests_after_each, "test_fn", "must be given", fix=fix)
     test_fn = test_fn if training.tests_after_each else None
     # A curve of tests may end at either limit.
     if test_fn is None and (proxy := proxy_in(env)) is not None:
@@ -460,7 +459,7 @@ class _Loop:
         env_action = self.agent.env_action(action)
         is_index = not jnp.issubdtype(jnp.result_type(env_action), jnp.floating)
         is_fit = is_index or not isinstance(spaces_of(self.env)[1], Discrete)
-        require(is_fit, "agent.act", "must give an index on this task", got=env_action)
+        require(is_fit, "agent.act", "must give an index, jnp.int32, on this task")
         next_obs, env_state, reward, terminated, info = self.env.step_env(
             keys.env, state.env_state, env_action, consts.env_params
         )

@@ -297,7 +297,7 @@ def test_an_episode_ends_where_the_tasks_own_does():
 def test_proxies_step_in_double_precision_too(task):
     for config in (RewardConfig(), sejax.SyntheticConfig(horizon=None, initial_state="real")):
         env = config.make(envs.make(task))
-        params = env.params(env.init_weights(KEY))
         with jax.enable_x64(True):
+            params = env.params(env.init_weights(KEY))
             out = jax.eval_shape(env.step, KEY, env.reset(KEY, params)[1], jnp.int32(0), params)
         assert out[2].shape == ()

@@ -61,8 +61,7 @@ def make_agent(
       >>> agent.spec.warmup_episodes
       1
     """
-    fix = "Write make_agent(config, task), with a configuration such as DDQNConfig()."
-    require_part("agent", AgentConfig, config, fix)
+    require_part("agent", AgentConfig, config, "Write make_agent(DDQNConfig(), task), or another.")
     require_part("task", TaskSpec, task, "Set task to env.task, or sejax.Task(name=..., env=env).")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)

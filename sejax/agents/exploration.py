@@ -293,7 +293,7 @@ def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
 
 def action_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
     """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
-    return action if action.ndim > 1 else jax.nn.one_hot(action, width, axis=0)
+    return action if action.ndim > 1 else jax.nn.one_hot(jnp.int32(action), width, axis=0)
 
 
 # --- counts --------------------------------------------------------------------------------------

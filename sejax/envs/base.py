@@ -65,8 +65,9 @@ class Task(TaskSpec):
         require(is_known, "env.solved_reward", "must be a number", got=solved_reward, use="inf")
         rule = "must be a gymnax 1.x environment, in JAX"
         fix = "Write env, params = gymnax.make(...)." if isinstance(self.env, tuple) else ""
-        require(hasattr(self.env, "default_params"), "env", rule, got=self.env, fix=fix)
         with foreign_code("env", f"{rule}; {self.name}"):
+            is_env = hasattr(self.env, "step_env") or hasattr(self.env, "default_params")
+            require(is_env, "env", rule, got=self.env, fix=fix)
             params = self.env.default_params if self.params is None else self.params
             limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
             max_steps = checked(limit, Count, "env.max_steps", 200)

@@ -64,6 +64,7 @@ class GridWorld(Environment[GridState, GridParams]):
         Raises:
           ConfigError: for another map.
         """
+        rows = ["".join(row) for row in rows]
         is_map = len({*map(len, rows)}) == 1 and {*"".join(rows)} <= {*"SGO# "}
         rule = "must be texts of one length, with one S, else G, O, # and spaces"
         require(is_map and "".join(rows).count("S") == 1, "rows", rule, got=rows)

@@ -64,6 +64,8 @@ class ActionRepeat(Wrapper[EnvState, EnvParams]):
     def __init__(self, env: Environment, num_repeats: int):
         super().__init__(env)
         self.num_repeats = num_repeats
+        if isinstance(env, Environment):
+            self.spaces = env.spaces  # without a proxy's default params, whose weights are drawn
 
     def step_env(
         self, key: Array, state: EnvState, action: Array, params: EnvParams

@@ -152,6 +152,8 @@ def shortened(value: object, length: int = 80) -> str:
 def foreign_code(field: str, rule: str) -> Iterator[None]:
     """Turns what code of others raises in the block into a `ConfigError` that tells it.
 
+    A `ConfigError` passes as it is.
+
     Args:
       field: the field at fault.
       rule: what the code must do, and its name, after which the message says "raised ...".

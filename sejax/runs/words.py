@@ -56,9 +56,10 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             field = shortened(name.strip("- ") or "NAME")
-            is_name = name.isidentifier() and not registry.is_registered("env", name)
+            is_choice = any(registry.is_registered(group, field) for group in registry.GROUPS)
+            is_name = field.isidentifier() and not is_choice
             is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS or is_name
-            value = f"{field}={shortened(text) or 'VALUE'}"
+            value = f"{field}={shortened(text.strip()) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
