@@ -148,7 +148,7 @@ class Scoring:
         population, incumbent = jnp.split(of_trainings, [self.layout.num_on_candidates])
         turns = incumbent.reshape(-1, self.layout.mixture.size).T  # [agent, turn]
         pairs = zip(turns, self._of_agents(population), strict=True)
-        by_agent = [with_diverged_last(scores, mine) for scores, mine in pairs]
+        by_agent = [with_diverged_last(scores, evaluations) for scores, evaluations in pairs]
         incumbent, agent_means = map(jnp.stack, zip(*by_agent, strict=True))  # [agent, *turn]
         aggregate = jnp.mean if self.layout.mixture.aggregate == "mean" else jnp.min
         return Scores(

@@ -194,8 +194,8 @@ def make_trainer(
     """Builds `train(key, env_params, hparams=None, active=True) -> TrainResult` for one agent.
 
     `train` is pure; `vmap` it over keys, parameters and hyperparameters. On a GPU all agents then
-    step together, as long as the longest training. On a CPU `vmap` gives a `lax.map` over batches
-    of the width that suits the agent, often one. No replay buffer is copied. With `active=False` no
+    step together until the longest training ends. On a CPU `vmap` gives a `lax.map` over batches of
+    the width that suits the agent, often one. No replay buffer is copied. With `active=False` no
     step is taken.
 
     Args:

@@ -61,7 +61,7 @@ def make_agent(
       >>> agent.spec.warmup_episodes
       1
     """
-    require_part("agent", AgentConfig, config, "Write make_agent(DDQNConfig(), task), or another.")
+    require_part("agent", AgentConfig, config, "Write make_agent(DDQNConfig(), task), for example.")
     require_part("task", TaskSpec, task, "Set task to env.task, or sejax.Task(name=..., env=env).")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)

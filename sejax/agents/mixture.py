@@ -80,7 +80,7 @@ class Mixture:
         is_weighted = all(0 <= x <= LARGEST for x in self.weights) and any(self.weights)
         require(is_weighted, "agents", "must have weights from 0, one above", got=self.weights)
         for agent in self.agents:
-            fix = "Use sejax.make_agent, for several in sejax.Mixture(agents=...)."
+            fix = "sejax.make_agent makes one; sejax.Mixture(agents=...) joins several."
             require_part("agent", Agent, agent, fix)
 
     @classmethod

@@ -65,9 +65,10 @@ class GridWorld(Environment[GridState, GridParams]):
           ConfigError: for another map.
         """
         rows = ["".join(row) for row in rows]
-        is_map = len({*map(len, rows)}) == 1 and {*"".join(rows)} <= {*"SGO# "}
+        characters = "".join(rows)
+        is_map = len({*map(len, rows)}) == 1 and {*characters} <= {*"SGO# "}
         rule = "must be texts of one length, with one S, else G, O, # and spaces"
-        require(is_map and "".join(rows).count("S") == 1, "rows", rule, got=rows)
+        require(is_map and characters.count("S") == 1, "rows", rule, got=rows)
         cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._default_params = params or GridParams()

@@ -138,9 +138,8 @@ def se_task(header: Header, config: SyntheticConfig, task: RealTask | str | None
     require(has_limit, "task", f"must have max_steps={limit}", got=task.max_steps)
     is_same = task.action_space == learned.action_space
     rule = f"must have actions of {learned.action_space}"
-    kinds = {type(task.action_space), type(learned.action_space)}
-    is_rescaled = kinds == {spaces.Box}
-    fix = "Wrap it in RescaleAction." if is_rescaled else "Give the id of the proxy's own."
+    are_boxes = {type(task.action_space), type(learned.action_space)} == {spaces.Box}
+    fix = "Wrap it in RescaleAction." if are_boxes else "Give the id of the proxy's own."
     require(is_same, "task", rule, got=task.action_space, fix=fix)
     is_same = signature(task.observation_space) == signature(learned.observation_space)
     rule = f"must observe {shortened(learned.observation_space)}"
