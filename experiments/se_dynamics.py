@@ -106,9 +106,9 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
     task = envs.make(settings.env)
     tuned = agents.tuned_agent(settings.env, agents.usual_kind(task))
     students = {x: settings.agent_of(x) for x in agents.kinds_of_students(settings)}
+    configs = {kind: settings.config_of(kind) for kind in settings.kinds}
     curves, tests = [], [se_myopia.untrained(settings, task, tuned)]
-    for kind in settings.kinds:
-        config = settings.config_of(kind)
+    for kind, config in configs.items():
         chunks = make_chunks(config)
         folder = settings.work_folder / "runs" / kind
         for run in runs.configs_of(config, settings.runs, folder):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_close, assert_equal, refused
+from support import arrays_of, assert_close, assert_equal, refused
 
 import sejax
 from sejax import agents, envs, make_agent, make_trainer
@@ -159,13 +159,13 @@ def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alon
     if case[2] != "none":
         varied = [agent.hparams.replace(agent=each) for each in varied]
     key = jax.random.key(2)
-    started_with = [start(key, jax.tree.map(jnp.float32, each)) for each in varied]
+    started_with = [start(key, jax.tree.map(np.float32, each)) for each in varied]
     states, batches = zip(*started_with, strict=True)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    stacked = jax.tree.map(lambda *x: np.stack(x), *states)
     together = jax.jit(jax.vmap(agent.update, (None, 0, None)))(key, stacked, batches[0])
     alone = [update_of(case)(key, state, batches[0]) for state in states]
     for i, each in enumerate(alone):
-        assert_close(jax.tree.map(lambda x, i=i: x[i], together), each, rtol=1e-3, atol=1e-4)
+        assert_close([x[i] for x in arrays_of(together)], each, rtol=1e-3, atol=1e-4)
     assert moved(*alone)
 
 
@@ -191,7 +191,7 @@ def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
 
 @pytest.mark.parametrize("case", cases([*OFF_POLICY, *EXPLORING[:2]]), ids="-".join)
 def test_columns_of_no_weight_change_nothing(case):
-    state, batch = started(case)
+    state, batch = jax.device_get(started(case))
     update, key = update_of(case), jax.random.key(0)
     assert batch.weight.sum() == BATCH
     is_padding = 1 - batch.weight
@@ -201,15 +201,15 @@ def test_columns_of_no_weight_change_nothing(case):
         next_obs=batch.next_obs - is_padding,
     )
     assert_close(update(key, state, batch), update(key, state, other), rtol=1e-5, atol=1e-7)
-    all_count = batch._replace(weight=jnp.ones_like(batch.weight))
+    all_count = batch._replace(weight=np.ones_like(batch.weight))
     assert moved(update(key, state, batch), update(key, state, all_count))
 
 
 @every_off_policy_agent
 def test_units_and_columns_out_of_use_take_no_part(case):
     _, agent, start = parts(case)
-    hparams = agent.hparams.replace(hidden_size=jnp.float32(2), batch_size=jnp.float32(5))
-    state, batch = start(jax.random.key(1), hparams)
+    hparams = agent.hparams.replace(hidden_size=np.float32(2), batch_size=np.float32(5))
+    state, batch = jax.device_get(start(jax.random.key(1), hparams))
     assert agent.batch_size(state) == 5 and batch.weight.sum() == 5
     # Parameters that init narrowed to 0, in whichever of the state's vectors.
     leaves = [x for x in jax.tree.leaves(state) if x.ndim]

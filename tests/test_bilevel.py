@@ -58,7 +58,7 @@ def on_one_device(words):
     """Program on one device, its compiled generation, and a run of three generations per key."""
     program = program_of("devices=1", words=words)
     generation, state = compiled(program, KEYS[0])
-    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
+    runs = [run(generation, state, 3), run(generation, jax.jit(program.init)(KEYS[1]), 3)]
     return program, generation, runs
 
 
@@ -148,7 +148,7 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
 
 
 def assert_result_equals_run(result, program, states, infos, **tolerance):
-    history = jax.tree.map(lambda *x: jnp.stack(x), *infos)
+    history = jax.tree.map(lambda *x: np.stack(x), *infos)
     last = states[-1]
     expected = (program.unravel(last.best.weights), program.unravel(last.last.weights), history)
     assert_close((result.weights, result.last_weights, result.info), expected, **tolerance)

@@ -132,7 +132,7 @@ def two():
     The outcome is that of one training after another, each with a single agent's evaluator.
     """
     bilevel = bilevel_of(Mixture(agents=AGENTS, names=("q", "sarsa"), weights=(2.0, 1.0)))
-    state = bilevel.init(KEY)
+    state = jax.jit(bilevel.init)(KEY)
 
     @jax.jit
     def generation(state):
@@ -145,7 +145,7 @@ def two():
     agent = np.array([0, 0, 1, 1, 0, 0] * 2 + [0, 1, 0, 1])
     keys = jnp.concatenate([group.ravel() for group in candidates.keys])
     vectors = np.repeat(candidates.population, 2, axis=0), [candidates.incumbent] * 4
-    params = jax.vmap(lambda vector: PROXY.params(bilevel.unravel(vector)))(np.concatenate(vectors))
+    params = jax.jit(jax.vmap(lambda x: PROXY.params(bilevel.unravel(x))))(np.concatenate(vectors))
     evaluators = [make_evaluator(agent, PROXY, TASK, TRAINING) for agent in AGENTS]
     run_all = jax.jit(lambda *x: [jax.lax.map(lambda y, run=run: run(*y), x) for run in evaluators])
     by_agent = jax.device_get(run_all(keys, params))

@@ -69,7 +69,7 @@ AGENTS = {
 
 
 @pytest.mark.parametrize(("name", "kind"), [
-    pytest.param(name, kind, marks=[pytest.mark.slow] * (name not in ("ddqn", "td3", "ppo")))
+    pytest.param(name, kind, marks=[pytest.mark.slow] * (name not in ("ddqn", "ppo")))
     for name, config in AGENTS.items() for kind in config.actions
 ])  # fmt: skip
 def test_a_bandits_best_action_is_found(name, kind):

@@ -309,7 +309,7 @@ def saved(path: Path) -> int:
     return tensors["metrics"].tobytes().count(b"\n") - 1
 
 
-@pytest.mark.parametrize("error", [Killed, Full])
+@pytest.mark.parametrize("error", [Killed, pytest.param(Full, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("start", "block", "operations"), [(0, 1, 20), (0, 2, 18), (1, 1, 12)])
 def test_after_a_kill_or_a_full_disk_at_any_file_operation_it_goes_on_from_a_whole_moment(
     tmp_path, monkeypatch, start, block, operations, error

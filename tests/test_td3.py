@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from support import assert_equal, drawing, numpy_forward, random_columns, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
@@ -114,7 +113,8 @@ def initial_params(config):
         vector = np.float32(0.5 * rng.normal(size=vectors(name, like).shape))
         if "critics" in name:
             one = jax.tree.map(lambda x: x[0], like)
-            params = jax.vmap(ravel_pytree(one)[1])(vector)["params"]
+            pair = [unraveled(row, one)["params"] for row in vector]
+            params = jax.tree.map(lambda *x: np.stack(x), *pair)
         else:
             params = unraveled(vector, like)["params"]
         if "width" in params:  # no weight: the number of units

@@ -61,7 +61,7 @@ def trainer(variant):
 
 def stacked(scripts):
     """The scripts of several lanes as one."""
-    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *scripts)
+    return jax.tree.map(lambda *x: np.stack(x), *scripts)
 
 
 def plain_training(returns, lengths, rule, min_steps=0):
@@ -270,8 +270,8 @@ def scripted_lanes():
     rng = np.random.default_rng(0)
     scripts = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(5)]
     scripts.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
-    active = jnp.array([True, True, False, True, True, True])
-    return jax.random.split(KEY, 6), stacked(scripts), jnp.arange(6.0), active
+    active = np.array([True, True, False, True, True, True])
+    return jax.random.split(KEY, 6), stacked(scripts), np.arange(6, dtype=np.float32), active
 
 
 @pytest.mark.parametrize(("variant", "shape"), [("plateau", (6,)), ("tested", (2, 3))])
@@ -281,8 +281,8 @@ def test_lanes_equal_single_trainings(variant, shape):
         in_lanes = jax.vmap(in_lanes)
     lanes = scripted_lanes()
     many = jax.jit(in_lanes)(*jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), lanes))
-    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[len(shape) :]), many)
-    assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
+    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[len(shape) :]), jax.device_get(many))
+    assert len(set(many.train_steps.tolist())) > 2  # stopped at different times
     for i in range(6):
         lane, alone = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (many, lanes))
         assert_close(lane, train(*alone), rtol=1e-4, atol=1e-4)

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -20,7 +20,7 @@ from sejax.proxies.synthetic import SyntheticConfig, Units
 
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
-LIMIT = np.float32(MAX_ABS_VALUE)
+Number: TypeAlias = float | np.ndarray
 
 
 class SyntheticWorld:
@@ -84,7 +84,7 @@ class SyntheticWorld:
         vector = drawn
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
-        return np.minimum(np.maximum(self._units.decode(vector), -LIMIT), LIMIT)
+        return np.minimum(np.maximum(self._units.decode(vector), -MAX_ABS_VALUE), MAX_ABS_VALUE)
 
     def encode(self, action: ArrayLike, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
@@ -106,7 +106,7 @@ class SyntheticWorld:
         raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
 
     def step(
-        self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None
+        self, vector: np.ndarray, action: np.ndarray, time: Number, chance: Number | None = None
     ) -> tuple[np.ndarray, Any, Any, Any, Any]:
         """One step of each episode.
 

@@ -7,7 +7,7 @@ the bit for any number of devices, and up to rounding for any width of a batch
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +84,7 @@ def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
 
 
-def _strongly_typed(x: Any) -> Array:
+def _strongly_typed(x: Array | np.ndarray) -> Array:
     x = jnp.array(x)  # a copy: a state whose arrays are shared cannot be donated
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return x if is_key else jax.lax.convert_element_type(x, x.dtype)

@@ -133,7 +133,7 @@ class RemoteChunks(Chunks):
         self.compiled[length] = functools.partial(self._generations, *self._program, length)
 
     @functools.cached_property
-    def _program(self) -> tuple[Any, list[Outcome]]:
+    def _program(self) -> tuple[jax.stages.Compiled, list[Outcome]]:
         """The program of `ask` and `tell`, and the outcomes that it is given to ask.
 
         One program does both, and runs twice in a generation. In a program of `ask` alone, XLA
