@@ -148,7 +148,6 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     assert {"learning_rate", "discount"} <= set(options)
     assert agent.discount(agent.hparams) == 0.9
     assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, 0 if case[0] == "ppo" else 3)
-    assert agent.spec.sizes is not None
 
 
 @pytest.mark.parametrize("case", cases([*PLAIN, *EXPLORING]), ids="-".join)

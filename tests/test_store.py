@@ -68,8 +68,9 @@ def test_every_flipped_bit_and_lost_byte_is_noticed():
 
 def test_a_damaged_entry_or_a_folder_is_refused(folder):
     path, store = folder / "rounds.safetensors", Store(folder, SETTINGS)
+    (folder / "other.safetensors").write_bytes(path.read_bytes())
     path.write_bytes(path.read_bytes()[:-1])
-    assert refused(store.get, "rounds") == "run_dir"
+    assert refused(store.get, "rounds") == refused(store.get, "other") == "run_dir"
     path.unlink()
     path.mkdir()
     assert refused(store.get, "rounds") == "run_dir"

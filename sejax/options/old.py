@@ -25,8 +25,8 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     Older versions wrote an only agent as `agent`, and the settings of a mixture among its agents.
     """
     new = {k: x for k, x in config.items() if x is not None or k not in ("agent", "agents")}
-    if isinstance(agent := new.get("agent"), Mapping) and "name" in agent:
-        new["agents"] = {registry.key_of(str(agent["name"])): new.pop("agent")}
+    if isinstance(agent := new.get("agent"), Mapping) and isinstance(agent.get("name"), str):
+        new["agents"] = {registry.key_of(agent["name"]): new.pop("agent")}
     agents = new.setdefault("agents", {})
     if isinstance(agents, Mapping) and "mixture" not in new:
         new |= _without_mixture(agents)

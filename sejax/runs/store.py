@@ -106,10 +106,10 @@ class Store:
         """
         try:
             tensors, values = checksummed.read(self.file(name), KIND)
-            version = values.pop("format_version")
+            made = values.pop("format_version"), values.pop("entry", name)
             stored = dict(values.pop("config"))
-            if version != FORMAT_VERSION:
-                raise ValueError(f"its format is {version}")
+            if made != (FORMAT_VERSION, name):
+                raise ValueError(f"its format and name are {shortened(made)}")
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -137,8 +137,8 @@ class Store:
         """
         if self._lock.is_locked and not self._is_held():
             raise FileNotFoundError(f"{self.folder} was removed while it was in use")
-        manifest = {"format_version": FORMAT_VERSION, "config": self.settings, **values}
-        write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest))
+        manifest = {"format_version": FORMAT_VERSION, "config": self.settings, "entry": name}
+        write_bytes(self.file(name), checksummed.pack(dict(tensors or {}), KIND, manifest | values))
         self._has_entry = True
 
     def once(self, name: str, compute: Callable[[], Tensors]) -> dict[str, np.ndarray]:

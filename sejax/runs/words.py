@@ -55,7 +55,7 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
     for override in overrides:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
-            field = shortened(name.strip("- ") or "NAME")
+            field = shortened(name.strip("-. ") or "NAME")
             is_choice = any(registry.is_registered(group, field) for group in registry.GROUPS)
             is_name = field.isidentifier() and not is_choice
             is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS or is_name

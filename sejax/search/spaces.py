@@ -140,7 +140,7 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     Raises:
       ConfigError: if it is missing, is no such file, or names a `module:attribute`.
     """
-    path = Path(name) if name.endswith(".yaml") else FOLDER / f"{name}.yaml"
+    path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     try:
         texts = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
         with_agent = texts.pop("with_agent", None) or {}
