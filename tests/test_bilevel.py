@@ -58,7 +58,7 @@ def on_one_device(words):
     """Program on one device, its compiled generation, and a run of three generations per key."""
     program = program_of("devices=1", words=words)
     generation, state = compiled(program, KEYS[0])
-    runs = [run(generation, state, 3), run(generation, jax.jit(program.init)(KEYS[1]), 3)]
+    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
     return program, generation, runs
 
 
