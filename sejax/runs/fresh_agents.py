@@ -181,8 +181,8 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
         task = envs.make_from(configure("env", {**fields, "name": config.env}))
-    if (kind := config.proxy_kind) is not None:
-        proxy_config = configure("proxy", {**stored["proxy"], "name": kind}, "proxy_kind")
+    if (name := config.proxy_kind) is not None:
+        proxy_config = configure("proxy", {**stored["proxy"], "name": name}, "proxy_kind")
     proxy = load_proxy(path, task, proxy_config, "proxy")
     stored_name = str(stored["env"].get("name"))
     is_by_hand = stored_name.endswith(header.BY_HAND)

@@ -106,10 +106,10 @@ class Store:
         """
         try:
             tensors, values = checksummed.read(self.file(name), KIND)
-            made = values.pop("format_version"), values.pop("entry", name)
+            identity = values.pop("format_version"), values.pop("entry", name)
             stored = dict(values.pop("config"))
-            if made != (FORMAT_VERSION, name):
-                raise ValueError(f"its format and name are {shortened(made)}")
+            if identity != (FORMAT_VERSION, name):
+                raise ValueError(f"its format and name are {shortened(identity)}")
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
