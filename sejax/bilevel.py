@@ -28,7 +28,7 @@ from sejax.generation import Candidates, GenerationEvaluator, Layout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops.parallel import copy_to_devices
 from sejax.ops.scores import or_minus_inf, reaches
-from sejax.options import Count, checked, require
+from sejax.options import LARGEST, Count, checked, require
 from sejax.options.registry import Makes, make, require_part
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.synthetic import SyntheticConfig
@@ -256,6 +256,8 @@ def make_bilevel(
     require(proxy.task is task, "proxy", "must be of the given task object. Set task=proxy.task.")
     objective = make("objective", objective, task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
+    size = sum(x.size for x in jax.tree.leaves(shapes))
+    require(size <= LARGEST, "proxy", f"must have at most {LARGEST} weights", got=size)
     example, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
     strategy = make("es", es, example.size)
     _require_population(strategy, example)

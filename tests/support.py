@@ -118,7 +118,7 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
     return x
 
 
-def random_columns(rng, obs_dim, batch_size):
+def batch_of(rng, obs_dim, batch_size):
     """A batch's arrays but for its actions; discounts are such as an SE's soft done output."""
     arrays = {
         "obs": rng.normal(size=(obs_dim, batch_size)),

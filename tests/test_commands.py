@@ -45,7 +45,7 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path, monkeypatch, cap
 
 @pytest.mark.parametrize(("words", "fix"), [
     (["--env", "cartpole"], "Write env=VALUE."), (["--env=cartpole"], "Write env=cartpole."),
-    (["acrobot"], "Write env=acrobot or proxy=acrobot."), (["env"], "Write env=VALUE."),
+    (["acrobot"], "Write env=acrobot or proxy=acrobot."), (["env pole"], "Write env=pole."),
 ])  # fmt: skip
 def test_what_is_no_override_is_answered_with_one(words, fix):
     assert fix in str(refusal(sejax.config, words))

@@ -193,7 +193,7 @@ def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1",
                                   "preset: other.yaml", "agent: {batch_size: {x: 1}}",
-                                  "1: 2", "\x00", "- &a [*a]"])  # fmt: skip
+                                  "1: 2", "\x00", "a: &a 1\nb: *a"])  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
     refused(f"preset={tmp_path / 'bad.yaml'}")
@@ -226,6 +226,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("stop_when_solved=maybe", "stop_when_solved", ""), ("agents=[ddqn,ddqn]", "agents", ""),
     ("agents=[ddqn,ppo] mixture.weights.ddqn=0 mixture.weights.ppo=0", "mixture.weights", ""),
     ("agents=[ddqn,ppo] mixture.weights.ddqn=-1", "mixture.weights.ddqn", ""),
+    ("agents=[ddqn,ppo] mixture.weights=1", "mixture.weights", "Set mixture.weights.KEY=VALUE."),
     ("agents=[ddqn,ppo] mixture.weights.ddq=2", "mixture.weights.ddq", "mixture.weights.ddqn?"),
     ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
     ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),

@@ -7,15 +7,7 @@ from typing import get_args
 import jax
 import numpy as np
 import pytest
-from support import (
-    assert_shares,
-    drawing,
-    numpy_forward,
-    random_columns,
-    raveled,
-    shapes_of,
-    unraveled,
-)
+from support import assert_shares, batch_of, drawing, numpy_forward, raveled, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig, DuelingDDQNConfig
@@ -48,7 +40,7 @@ GOLDEN_UPDATES = [
 
 def random_batch(seed):
     rng = np.random.default_rng(seed)
-    columns = random_columns(rng, OBS_DIM, BATCH)
+    columns = batch_of(rng, OBS_DIM, BATCH)
     return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
 
 

@@ -145,7 +145,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     ("stored", "env=acrobot", "env"), ("room", "agent=ddqn", "agent"), ("real", "seed=1", "env"),
     ("real", "env=cartpole agent=q_learning", "agent"), ("nope", "seed=1", "proxy"),
     ("nope/proxy.safetensors", "seed=1", "proxy"), ("d" * 10_000, "seed=1", "proxy"),
-    ("room", "out_dir=setup.py/x", "out_dir"),
+    ("room", "out_dir=setup.py/x", "out_dir"), ("stored", "proxy_kind=rn", "proxy_kind"),
 ])  # fmt: skip
 def test_what_cannot_be_trained_is_refused_before_anything_starts(
     proxy, words, field, stored, room, monkeypatch, tmp_path

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from support import assert_close, assert_equal, random_columns, raveled, shapes_of, unraveled
+from support import assert_close, assert_equal, batch_of, raveled, shapes_of, unraveled
 
 from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
@@ -29,7 +29,7 @@ def random_batch(seed, kind):
     rng = np.random.default_rng(seed)
     action = rng.integers(0, WIDTH, BATCH) if kind == "index" else rng.normal(size=(WIDTH, BATCH))
     action = np.int32(action) if kind == "index" else np.float32(action)
-    columns = random_columns(rng, OBS_DIM, BATCH)
+    columns = batch_of(rng, OBS_DIM, BATCH)
     return Transition(action=action, weight=np.ones(BATCH, np.float32), **columns)
 
 

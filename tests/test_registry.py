@@ -154,12 +154,17 @@ def unknown(task, scale=2.0) -> "Unknown | Objective":
 wrong = lambda task: 3
 named = lambda task, name="pole": 3
 too_few = lambda: 3
+def unsized(task, size: int = "large"): return 3
 of_any = lambda task, *values, **more: 3
-Named = dataclasses.make_dataclass("Named", [("name", str, "pole")], namespace={"make": wrong})
+Named = dataclasses.make_dataclass("Named", ["name"], namespace={"make": staticmethod(wrong)})
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
     scale: "Unknown" = 2.0
+
+class Swapped(Plain):
+    def make(self):
+        return None
 
 class Vague(Plain):
     def make(self, task):
@@ -200,6 +205,7 @@ def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     ("scaled", {"scal": 1}, "objective.scale"), ("a_number", {}, "a dataclass with make(task)"),
     ("Plain", {}, "a dataclass with make(task)"), ("Outer", {}, "a dataclass with make(task)"),
     ("named", {}, "must take (task, option=default, ...)"),
+    ("Swapped", {}, "a dataclass with make(task)"), ("unsized", {}, "objective.size must"),
     ("too_few", {}, "must take (task, option=default, ...)"),
     ("Vague", {"scale": 2}, "'Unknown' is not defined"), ("a_number.nope", {}, "'nope'"),
     ("of_any", {}, "must take (task, option=default, ...)"), ("Named", {}, "no field `name`"),
@@ -233,13 +239,13 @@ def test_a_module_that_is_not_there_or_raises_is_one_message(module):
 @pytest.mark.parametrize(("typed", "meant"), [
     ("my_package.tasks.make", "env=my_package.tasks:make"), ("CartPole-v1", "env=cartpole_v1"),
     ("my_tasks.py:make_long_pole", "env=my_tasks:make_long_pole"), ("CARTPOLE", "env=cartpole."),
-    ("examples/own_task.py:make", "env=examples.own_task:make"),
+    ("examples/own_task.py:make", "env=examples.own_task:make"), ("1:2", "env=my_module:MyClass"),
 ])  # fmt: skip
 def test_a_name_in_another_notation_is_answered_with_ours(typed, meant):
     assert meant in refused("env", typed)
 
 
-@pytest.mark.parametrize("name", ["os.path:", ":join", "a b:c", "os:path-x", "1:2"])
+@pytest.mark.parametrize("name", ["os.path:", ":join", "a b:c", "os:path-x"])
 def test_what_is_no_module_and_attribute_is_not_imported(name):
     before = set(sys.modules)
     refused("agent", name)

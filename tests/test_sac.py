@@ -8,16 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import (
-    assert_equal,
-    assert_shares,
-    drawing,
-    numpy_forward,
-    random_columns,
-    raveled,
-    shapes_of,
-    unraveled,
-)
+from support import assert_shares, batch_of, drawing, numpy_forward, raveled, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.sac import SAC, DiscreteSAC, LearningNoise, SACConfig, squashed_gaussian
@@ -78,7 +69,7 @@ def case_batch(case, seed):
     rng = np.random.default_rng(seed)
     action = rng.uniform(-1, 1, (ACTION_DIM, BATCH))
     action = np.int32(action[0] > 0) if CASES[case][0] else np.float32(action)
-    return Transition(action=action, weight=WEIGHT, **random_columns(rng, OBS_DIM, BATCH))
+    return Transition(action=action, weight=WEIGHT, **batch_of(rng, OBS_DIM, BATCH))
 
 
 def case_noise(case, seed):
@@ -124,7 +115,7 @@ def test_a_squashed_gaussians_density_by_hand():
 def test_target_critics_start_as_copies_and_the_critics_apart():
     agent = agent_of("discrete")
     fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-    assert_equal(fresh.target_critics, fresh.params.critics)
+    assert (raveled(fresh.target_critics) == raveled(fresh.params.critics)).all()
     np.testing.assert_allclose(fresh.params.log_alpha, np.log(0.3), rtol=1e-6)
     assert not np.allclose(*fresh.params.critics["params"]["Dense_0"]["kernel"])
 

@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import sqlite3
 import subprocess
 import sys
 import time
@@ -218,6 +219,13 @@ def test_a_folder_may_have_any_name(tmp_path):
 def test_a_database_that_is_none_is_refused(tmp_path):
     (tmp_path / "study.db").write_bytes(b"no database" * 100)
     assert refused(command.main, [SPACE, f"search_dir={tmp_path}"]) == "search_dir"
+
+
+def test_a_changed_score_is_refused(tmp_path, learning):
+    worked(tmp_path, *ONE, "trials=1")
+    with sqlite3.connect(tmp_path / "study.db") as database:
+        database.execute("UPDATE trial_values SET value = value + 1")
+    assert refused(command.main, [SPACE, *ONE, f"search_dir={tmp_path}"]) == "search_dir"
 
 
 # --- results -------------------------------------------------------------------------------------

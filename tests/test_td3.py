@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_equal, drawing, numpy_forward, random_columns, shapes_of, unraveled
+from support import assert_equal, batch_of, drawing, numpy_forward, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
@@ -87,7 +87,7 @@ def case_batch(config, seed):
     action = rng.uniform(-MAX_ACTION, MAX_ACTION, (ACTION_DIM, BATCH))
     if is_discrete(config):
         action = np.eye(ACTION_DIM)[rng.integers(0, ACTION_DIM, BATCH)].T + 0.1 * action
-    columns = random_columns(rng, OBS_DIM, BATCH)
+    columns = batch_of(rng, OBS_DIM, BATCH)
     return Transition(action=np.float32(action), weight=WEIGHT, **columns)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support import random_columns
+from support import batch_of
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQN, DDQNConfig
@@ -35,7 +35,7 @@ def test_updates_equal_sejaxs_on_the_same_batches():
     torch_state = reference.ddqn_state(torch_network(state.params))
     rng = np.random.default_rng(0)
     for _ in range(2):
-        columns = random_columns(rng, OBS_DIM, BATCH)
+        columns = batch_of(rng, OBS_DIM, BATCH)
         batch = Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, BATCH)), **columns)
         state = update(jax.random.key(0), state, batch)
         reference.ddqn_update(torch_state, reference.batch_from_sejax(batch), CONFIG)

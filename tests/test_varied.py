@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import assert_close, random_columns, raveled, refused, shapes_of
+from support import assert_close, batch_of, raveled, refused, shapes_of
 
 import sejax
 from experiments.common.agents import paper_agent
@@ -85,7 +85,7 @@ def embed(small, large):
 
 def random_batch(num_columns, seed):
     rng = np.random.default_rng(seed)
-    columns = random_columns(rng, OBS_DIM, num_columns)
+    columns = batch_of(rng, OBS_DIM, num_columns)
     return Transition(action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)), **columns)
 
 

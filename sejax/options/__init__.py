@@ -294,7 +294,10 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
             raise unknown_name(name, str(got), typing.get_args(hint)) from None
         if isinstance(got, Mapping):
             raise ConfigError(name, "must have no fields", got=got, fix="Leave them out.") from None
-        if problem["type"] == "tuple_type":
+        if problem["type"] == "dict_type":
+            use = f"{name}.KEY=VALUE"
+            raise ConfigError(name, "must be values by key", got=got, fix=f"Set {use}.") from None
+        if problem["type"] == "tuple_type" and not str(got).startswith("["):
             use = f"[{shortened(got, 20)}]"
             raise ConfigError(name, "must be a list in brackets", got=repr(got), use=use) from None
         rule = problem["msg"].replace("Input should", "must").partition(", unable")[0]

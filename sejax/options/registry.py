@@ -174,10 +174,10 @@ def find(group: str, name: str) -> Any:
     if inspect.isfunction(plugin):
         plugin = _from_function(group, name, plugin)
     base = resolve_name(GROUPS[group].base)
-    is_config = dataclasses.is_dataclass(plugin) and hasattr(plugin, "make")
-    is_fit = isinstance(plugin, type) and is_config and issubclass(plugin, base)
+    is_class = isinstance(plugin, type) and dataclasses.is_dataclass(plugin)
+    is_fit = is_class and issubclass(plugin, base) and _can_make(group, plugin, base)
     rule = f"must name a function, or a dataclass with make({', '.join(GROUPS[group].arguments)})"
-    rule += f" that derives from {base.__module__}.{base.__name__}"
+    rule += "" if base is object else f" that derives from {base.__module__}.{base.__name__}"
     require(is_fit, group, rule, got=f"{shortened(name, 40)}, which is {plugin}")
     # A registered class may serve several names, and then has such a field.
     is_free = path is not None or "name" not in plugin.__dataclass_fields__
@@ -185,6 +185,19 @@ def find(group: str, name: str) -> Any:
     if f"{plugin.__module__}:{plugin.__qualname__}" != name:
         _NAMES[plugin] = name
     return plugin
+
+
+def _can_make(group: str, plugin: type, base: type) -> bool:
+    """Whether a class has its own `make`, which takes the group's arguments."""
+    make = inspect.getattr_static(plugin, "make", None)
+    is_own = make is not inspect.getattr_static(base, "make", None)
+    if not inspect.isfunction(make):  # such as a static method or a property
+        return is_own
+    try:
+        inspect.signature(make).bind(None, *GROUPS[group].arguments)
+    except TypeError:
+        return False
+    return is_own
 
 
 def name_of(group: str, config: object) -> str:
@@ -292,7 +305,7 @@ def require_path(field: str, path: str) -> None:
 
 def _suggestions(text: str) -> list[str]:
     """The `module:attribute` that the user may mean by a dotted name or the path of a file."""
-    match = re.fullmatch(r"([\w./]*?\w)(?:\.py)?[:.](\w+)", text)
+    match = re.fullmatch(r"([./]*[^\W\d][\w./]*?)(?:\.py)?[:.]([^\W\d]\w*)", text)
     return [f"{match[1].strip('./').replace('/', '.')}:{match[2]}"] if match else []
 
 
@@ -337,7 +350,8 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
         fields.append((p.name, Any if p.annotation is p.empty else p.annotation, field))
     base = resolve_name(GROUPS[group].base)
     bases = (base if issubclass(base, Options) else Options,)
-    namespace = {"make": make, "__doc__": function.__doc__, "__module__": function.__module__}
+    of_function = {"__doc__": function.__doc__, "__module__": function.__module__}
+    namespace = {"group": group, "make": make, **of_function}
     return dataclasses.make_dataclass(
         function.__name__, fields, bases=bases, namespace=namespace, frozen=True, kw_only=True
     )

@@ -55,11 +55,12 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
     for override in overrides:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
-            field = shortened(name.strip("-. ") or "NAME")
+            field, _, after = name.strip("-. ").partition(" ")
+            field = shortened(field or "NAME")
             is_choice = any(registry.is_registered(group, field) for group in registry.GROUPS)
-            is_name = field.isidentifier() and not is_choice
+            is_name = bool(NAME.fullmatch(field)) and not is_choice
             is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS or is_name
-            value = f"{field}={shortened(text.strip()) or 'VALUE'}"
+            value = f"{field}={shortened((text or after).strip()) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
@@ -91,7 +92,10 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     path = Path(with_home(texts.pop("preset")))
     typed = _tree(texts, groups)
     try:
-        values = flatten(yaml.safe_load(path.read_text(encoding="utf-8")))
+        text = path.read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise ValueError("it has aliases")  # a few lines of which can make billions of values
+        values = flatten(yaml.safe_load(text))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         drop_other_choices(file, typed, groups)
         return drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed

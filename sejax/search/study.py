@@ -63,7 +63,10 @@ def open_study(plan: StudyPlan) -> optuna.Study:
             load_if_exists=True,
         )
         try:
-            study.get_trials(deepcopy=False)  # reads all of it
+            for trial in study.get_trials(deepcopy=False):  # reads all of it
+                scores = trial.intermediate_values
+                if trial.state == TrialState.COMPLETE and trial.value != scores[budgets[1]]:
+                    raise ValueError(f"trial {trial.number} has two scores")
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
