@@ -151,7 +151,12 @@ class DDQN(OffPolicy):
         return epsilon_greedy(key, self.q_values(state.params, obs), state.epsilon, explore)
 
     def update(self, key: Array, state: DDQNState, batch: Transition) -> DDQNState:
-        """A step of Adam on the error to double-Q targets; then the target network follows.
+        r"""A step of Adam on the error to double-Q targets; then the target network follows.
+
+        .. math:: r + \gamma d\, Q'(s', \arg\max_a Q(s', a))
+
+        with the target network Q' and the transition's own discount d. With Q' in place of the
+        online network Q the targets are DQN's.
 
         Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
         """
@@ -162,7 +167,8 @@ class DDQN(OffPolicy):
             target_next_q = self.q_values(state.target_params, batch.next_obs)
             next_q = self.q_values(params, batch.next_obs) if self.config.double else target_next_q
             discount = hp.discount * batch.discount
-            targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
+            next_action = jnp.argmax(next_q, axis=0)
+            targets = batch.reward + discount * q_of_action(target_next_q, next_action)
             predicted = q_of_action(self.q_values(params, batch.obs), batch.action)
             return jnp.sum(batch.weight * (predicted - jax.lax.stop_gradient(targets)) ** 2)
 
@@ -187,23 +193,3 @@ def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
     """
     progress = jnp.minimum(num_steps / hparams.exploration_steps, 1.0)
     return hparams.epsilon_init + progress * (hparams.epsilon_min - hparams.epsilon_init)
-
-
-def double_q_targets(
-    online_next_q: Float[Array, "actions batch"],
-    target_next_q: Float[Array, "actions batch"],
-    reward: Float[Array, " batch"],
-    discount: Float[Array, " batch"],
-) -> Float[Array, " batch"]:
-    r"""Targets :math:`r + \gamma\, Q'(s', \arg\max_a Q(s', a))`.
-
-    Args:
-      online_next_q: Q of the online network at the next states; it chooses the actions. With Q' in
-        its place the targets are DQN's.
-      target_next_q: Q' of the target network at the next states.
-      reward: in the task's units.
-      discount: gamma times the transition's own discount.
-
-    Source: van Hasselt et al. (2016), eq. 4.
-    """
-    return reward + discount * q_of_action(target_next_q, jnp.argmax(online_next_q, axis=0))
