@@ -24,7 +24,7 @@ from pydantic import Field
 
 from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.tabular import entry_of, mask_of
+from sejax.agents.tabular import mask_of
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP, Dense
 from sejax.ops.optimizers import ADAM, apply_gradient
@@ -353,7 +353,7 @@ class CountBasedConfig(ExplorationConfig):
 
         def update(key: Array, state: CountingState, transition: Transition) -> CountingState:
             obs, action = transition.obs, transition.action
-            count = entry_of(state.counts, obs, action) + 1
+            count = state.counts.at[obs, action].get(mode="promise_in_bounds") + 1
             is_visited = mask_of(obs, action, shape)
             bonus = state.reward_scale * count.astype(jnp.float32) ** -self.count_power
             transition = transition._replace(reward=transition.reward + bonus)

@@ -136,11 +136,6 @@ def row_of(table: Array, state: Int[Array, ""]) -> Array:
     return table.at[state].get(mode="promise_in_bounds")
 
 
-def entry_of(table: Array, state: Int[Array, ""], action: Int[Array, ""]) -> Array:
-    """One entry of a table `[num_states, num_actions]`, `[]`."""
-    return table.at[state, action].get(mode="promise_in_bounds")
-
-
 def mask_of(state: Int[Array, ""], action: Int[Array, ""], shape: tuple[int, int]) -> Array:
     """True at one entry of a table of this shape, `[num_states, num_actions]` bool."""
     num_states, num_actions = shape
