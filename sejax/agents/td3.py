@@ -82,8 +82,7 @@ class DiscreteTD3Config(TD3Config):
     one_hot_actions: bool = False
 
     def make(self, task: Task) -> Agent:
-        assert task.num_actions is not None
-        return DiscreteTD3(self, task.obs_dim, task.num_actions, 1.0).agent()
+        return DiscreteTD3(self, task.obs_dim, task.action_dim).agent()
 
     def mlp(self, num_outputs: int) -> MLP:
         return super().mlp(num_outputs).clone(layer_norm=self.layer_norm)
