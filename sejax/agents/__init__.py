@@ -105,11 +105,10 @@ def require_fit(
     Raises:
       ConfigError: if one of them does not fit.
     """
-    name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
         known = fitting(spec) or ["MODULE:NAME"]
         rule = f"must be one of {', '.join(known)} in {task_name}"
-        raise ConfigError(field, rule, got=name, use=known[0])
+        raise ConfigError(field, rule, got=registry.name_of("agent", agent), use=known[0])
     is_fit = exploration.states is None or agent.states in (None, exploration.states)
     got = registry.name_of("exploration", exploration)
     require(is_fit, "exploration", f"must be for {agent.states} states", got=got, use="none")

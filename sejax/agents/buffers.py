@@ -161,8 +161,7 @@ def _dims(example: Transition) -> tuple[int, int | None]:
     Raises:
       ConfigError: for observations that are indices.
     """
-    rule = "must be no_buffer() where observations are indices"
-    require(example.obs.ndim, "agent.buffer", rule)
+    require(example.obs.ndim, "agent.buffer", "must be no_buffer() where observations are indices")
     action_dim = example.action.shape[0] if example.action.ndim else None
     return example.obs.shape[0], action_dim
 
