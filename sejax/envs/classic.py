@@ -77,8 +77,7 @@ class MountainCarContinuousEnv(Environment[CarState, CarParams]):
         force = jnp.clip(action, params.min_action, params.max_action)
         acceleration = params.power * force - params.gravity * jnp.cos(3 * state.position)
         velocity = jnp.clip(state.velocity + acceleration, -params.max_speed, params.max_speed)
-        position = state.position + velocity
-        position = jnp.clip(position, params.min_position, params.max_position)
+        position = jnp.clip(state.position + velocity, params.min_position, params.max_position)
         velocity = jnp.where((position <= params.min_position) & (velocity < 0), 0.0, velocity)
         state = CarState(position=position, velocity=velocity, time=state.time + 1)
         reward = jnp.where(self.is_terminated(state, params), 100.0, 0.0) - 0.1 * action**2
