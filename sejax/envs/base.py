@@ -81,9 +81,8 @@ class Task(TaskSpec):
             require(is_same, "env", "needs its own default_params", got=self.name)
             if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
                 _check_step(env, params, self.name)  # takes seconds; the others have tests
-        values = {"env": env, "params": params, "max_steps": max_steps}
-        values |= {"observation": observation, "action": action, "solved_reward": solved_reward}
-        vars(self).update(values)
+        vars(self).update(env=env, params=params, max_steps=max_steps)
+        vars(self).update(observation=observation, action=action, solved_reward=solved_reward)
 
     @classmethod
     def of(cls, spec: TaskSpec, *, name: str, env: Environment) -> "Task":
