@@ -149,6 +149,9 @@ class _StepKeys(NamedTuple):
         return cls(*step_keys(key, step, len(cls._fields)))
 
 
+LastReturns = Float[Array, " two_windows"]  # newest last
+
+
 class _LoopState(struct.PyTreeNode):
     """Carry of the step loop. Buffers and a row for each episode are carried beside it.
 
@@ -165,7 +168,7 @@ class _LoopState(struct.PyTreeNode):
     obs: Array
     env_state: PyTree
     agent_state: AgentState
-    recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
+    recent: LastReturns  # which the stop rule judges
     nonfinite: Array
     test_steps: Array
     tested: Array  # mean return of the last tests
@@ -525,7 +528,7 @@ class _Loop:
             recent=recent,
         )
 
-    def stops(self, state: _LoopState, recent: Array) -> Array:
+    def stops(self, state: _LoopState, recent: LastReturns) -> Array:
         """Whether training ends with the episode that has just ended.
 
         Args:
@@ -545,9 +548,7 @@ class _Loop:
         return stop
 
 
-def is_plateau(
-    recent: Float[Array, " two_windows"], num_episodes: Array, tolerance: float
-) -> Array:
+def is_plateau(recent: LastReturns, num_episodes: Array, tolerance: float) -> Array:
     r"""Whether the mean returns of the last d episodes and of the d episodes before are close.
 
     .. math:: |\bar C_d - \bar C_{2d}| / |\bar C_{2d}| \le C_{diff}
@@ -566,9 +567,7 @@ def is_plateau(
     return jnp.abs(newer - older) <= tolerance * (jnp.abs(older) + 1e-9)
 
 
-def is_solved(
-    recent: Float[Array, " two_windows"], num_episodes: Array, solved_reward: float
-) -> Array:
+def is_solved(recent: LastReturns, num_episodes: Array, solved_reward: float) -> Array:
     """Whether the mean of the last d returns (of all, if fewer) reaches the solved reward."""
     window = recent.shape[0] // 2
     return reaches(recent[window:].sum() / jnp.clip(num_episodes, 1, window), solved_reward)
