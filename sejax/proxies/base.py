@@ -15,9 +15,8 @@ import jax
 from flax import struct
 from jaxtyping import Array, PyTree
 
-from sejax.envs.base import Task
+from sejax.envs import Task, TaskSpec
 from sejax.envs.environment import Environment, EnvParams
-from sejax.envs.spec import TaskSpec
 from sejax.envs.wrappers import Wrapper
 from sejax.options import ConfigError, Options, as_text, shortened
 

@@ -14,16 +14,14 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PyTree
 
 from sejax import envs, options
-from sejax.agents import Agent, make_agent
-from sejax.agents.base import AgentConfig
+from sejax.agents import Agent, AgentConfig, make_agent
 from sejax.envs import Task, TaskSpec
 from sejax.envs.environment import Environment
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes
 from sejax.options import ConfigError, as_python, registry, require, require_known, shortened, told
 from sejax.options.plain import from_plain, to_plain
-from sejax.proxies import ProxyConfig, header
-from sejax.proxies.base import ProxyEnv
+from sejax.proxies import ProxyConfig, ProxyEnv, header
 from sejax.proxies.header import Header, Stored, check_tensors
 from sejax.training import TrainingConfig
 

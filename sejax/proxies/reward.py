@@ -14,9 +14,8 @@ from flax import struct
 from jaxtyping import Array, Float, PyTree
 from pydantic import Field
 
-from sejax.envs.base import Task
+from sejax.envs import Task, TaskSpec
 from sejax.envs.environment import EnvState
-from sejax.envs.spec import TaskSpec
 from sejax.ops.networks import MLP, uniform_fan_in
 from sejax.options import Activation, Count, Depth, require, require_known
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams

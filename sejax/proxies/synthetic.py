@@ -15,9 +15,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
 
-from sejax.envs.base import Task
+from sejax.envs import Box, Task, TaskSpec
 from sejax.envs.environment import EnvState
-from sejax.envs.spec import Box, TaskSpec
 from sejax.ops.networks import MLP
 from sejax.options import Activation, Count, Depth
 from sejax.proxies.base import MAX_ABS_VALUE, ProxyConfig, ProxyEnv, ProxyParams
