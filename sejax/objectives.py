@@ -4,10 +4,9 @@ An `Objective` turns an `Outcome` (one agent trained on a proxy, tested on the r
 number. `sejax.scoring` applies it to a generation.
 """
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -149,7 +148,7 @@ class MaxReward(ObjectiveConfig):
             steps = jnp.round(first + done * (last - first)).astype(jnp.int32)
             return PartParams(scored_steps=steps)
 
-        return dataclasses.replace(
+        return replace(
             objective,
             score=lambda outcome: outcome.scored_returns.mean(axis=-1),
             shown=objective.score,

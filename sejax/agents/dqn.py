@@ -5,8 +5,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 `docs/reference.md` 4.1 and 4.2.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, cast
 
 import jax
@@ -49,7 +48,7 @@ class DDQNConfig(OffPolicyOptions):
     def spec(self) -> AgentSpec:
         is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
         width = cpu.SMALL_NUM_PARALLEL if is_small else 1
-        return dataclasses.replace(super().spec(), cpu_num_parallel=width)
+        return replace(super().spec(), cpu_num_parallel=width)
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
@@ -85,7 +84,7 @@ class DuelingDDQNConfig(DDQNConfig):
 
     def spec(self) -> AgentSpec:
         # Under vmap its two streams make a step 1.5 times as long.
-        return dataclasses.replace(super().spec(), cpu_num_parallel=1)
+        return replace(super().spec(), cpu_num_parallel=1)
 
 
 @dataclass(frozen=True, kw_only=True)

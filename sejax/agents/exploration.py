@@ -10,8 +10,7 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 "Experiments with Reward Networks", paragraph "Baselines"; `docs/reference.md` 4.7 and 4.8.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import jax
@@ -46,7 +45,7 @@ def _wrapped(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
     def act(key: Array, state: AgentState, obs: Array, explore: bool) -> Array:
         return agent.act(key, state.agent_state, obs, explore)
 
-    return dataclasses.replace(
+    return replace(
         agent,
         begin_episode=begin_episode,
         act=act,
@@ -114,7 +113,7 @@ class ICMConfig(ExplorationConfig):
         module = ICM(self, task.action_dim)
         curious = Curious(agent, module, task.obs_dim, is_discrete=task.num_actions is not None)
         # The module's networks keep a core busy, whatever agent is inside.
-        spec = dataclasses.replace(agent.spec, cpu_num_parallel=1)
+        spec = replace(agent.spec, cpu_num_parallel=1)
         return _wrapped(agent, self, init=curious.init, update=curious.update, spec=spec)
 
 

@@ -5,9 +5,8 @@ mixture divides the candidates of a generation among several agents. So a step o
 helps all agents, with the same number of trainings.
 """
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 import jax.numpy as jnp
@@ -37,7 +36,7 @@ class MixtureConfig(Options):
     group: ClassVar[str] = "mixture"
 
     aggregate: Literal["mean", "min"] = "mean"
-    weights: dict[str, Weight] = dataclasses.field(default_factory=dict)
+    weights: dict[str, Weight] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,9 +4,8 @@ It has their options, their warm-up, how a batch is drawn, and the step of Adam 
 Each agent's own file has its networks, its loss and its targets.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import jax
@@ -73,7 +72,7 @@ class ActorCriticOptions(OffPolicyOptions):
     action_repeat: Count = 1
 
     def spec(self) -> AgentSpec:
-        return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)
+        return replace(super().spec(), action_repeat=self.action_repeat)
 
 
 class OffPolicy(Algorithm):

@@ -14,9 +14,8 @@ Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schul
 appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, cast
 
 import jax
@@ -114,7 +113,7 @@ class PPOConfig(AgentOptions):
         is_small = self.rollout_steps is not None and (
             self.hidden_size * (self.rollout_steps // self.num_minibatches) <= cpu.SMALL_PRODUCT
         )
-        return dataclasses.replace(
+        return replace(
             super().spec(),
             learns_from=0,
             action_repeat=self.action_repeat,

@@ -5,8 +5,7 @@ Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
 `docs/reference.md` 4.6.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -43,7 +42,7 @@ class QLearningConfig(AgentOptions):
     epsilon_decay: Fraction = option(0.0, traced=True)
 
     def spec(self) -> AgentSpec:
-        return dataclasses.replace(super().spec(), cpu_num_parallel=None)
+        return replace(super().spec(), cpu_num_parallel=None)
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's numbers of states and actions."""

@@ -3,8 +3,7 @@
 Only this module turns a sign: evosax minimises a fitness, and sejax maximises scores.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -114,7 +113,7 @@ class EvosaxConfig(StrategyOptions):
                 return state.replace(std=state.std / self.noise_std_decay)
             return state.replace(B=state.B / self.noise_std)  # evosax puts std_init into B as well
 
-        return dataclasses.replace(strategy, init=init)
+        return replace(strategy, init=init)
 
 
 def from_evosax(
