@@ -6,7 +6,7 @@ Each agent's own file has its networks, its loss and its targets.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,8 @@ from jaxtyping import Array, PyTree
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
 from sejax.ops.networks import MLP, init_narrowed
-from sejax.ops.optimizers import apply_gradient
+from sejax.ops.optimizers import Params, apply_gradient
 from sejax.options import Activation, Count, Depth, Fraction, Positive, option, require
-
-Params = TypeVar("Params")  # a pytree
 
 
 @dataclass(frozen=True, kw_only=True)
