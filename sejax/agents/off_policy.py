@@ -6,12 +6,12 @@ Each agent's own file has its networks, its loss and its targets.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import AgentOptions, AgentSpec, AgentState, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Transition, num_columns, replay_buffer, sum_over_batch
@@ -119,6 +119,10 @@ class ActorCritic(OffPolicy):
         init_critics = jax.vmap(lambda key: init_narrowed(self.critic, key, num_inputs, size))
         actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
         return actor, init_critics(jax.random.split(key_critics))
+
+    def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "outputs *batch"]:
+        """The actor's outputs."""
+        return cast(Array, self.actor.apply(actor, obs))
 
     def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
         return state.replace(is_warming_up=jnp.asarray(episode < self.config.warmup_episodes))

@@ -217,10 +217,6 @@ class TD3(ActorCritic):
             target_critics=optax.incremental_update(state.critics, state.target_critics, hp.tau),
         )
 
-    def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "action_dim *batch"]:
-        """The actor's outputs."""
-        return cast(Array, self.actor.apply(actor, obs))
-
     def q_value(self, critic: PyTree, obs: Array, action: Array) -> Float[Array, "*batch"]:
         """One critic's value of an action."""
         return cast(Array, self.critic.apply(critic, jnp.concatenate([obs, action])))[0]
