@@ -42,13 +42,10 @@ def _wrapped(agent: Agent, config: ExplorationConfig, **changes: Any) -> Agent:
     def begin_episode(state: AgentState, episode: Array) -> AgentState:
         return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))
 
-    def act(key: Array, state: AgentState, obs: Array, explore: bool) -> Array:
-        return agent.act(key, state.agent_state, obs, explore)
-
     return replace(
         agent,
         begin_episode=begin_episode,
-        act=act,
+        act=lambda key, state, obs, explore: agent.act(key, state.agent_state, obs, explore),
         hparams=traced(config).replace(agent=agent.hparams),
         discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
