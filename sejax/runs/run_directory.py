@@ -7,7 +7,7 @@ refused changes nothing.
 
 import secrets
 from collections.abc import Iterable, Mapping
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Self, TypeVar
 
 import jax
 import numpy as np
@@ -114,7 +114,7 @@ class RunDirectory(Store):
         """
         if self._tensors is None:
             return None
-        asked = jax.eval_shape(_bare, _named(like))
+        asked = jax.eval_shape(_named, like)
         if differing := differences(_shapes(self._tensors), _shapes(asked)):
             got = f"{self.folder}, whose state differs in {differing}"
             raise self.refused(f"must be of this version; got {got}")
@@ -140,7 +140,7 @@ class RunDirectory(Store):
         """
         new = self._rows_of(info, wall_s)
         csv = self._as_csv([*self.rows, *new])
-        tensors = jax.device_get(_bare(_named(state)))  # all at once
+        tensors = jax.device_get(_named(state))  # all at once
         tensors[_ROWS] = np.frombuffer(csv.encode(), np.uint8)
         self.put(_CHECKPOINT, tensors, id=self.id, cpu_s=cpu_s, versions=runtime.versions())
         self.rows += new
@@ -219,24 +219,22 @@ def _as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
       tensors: leaves by path.
       like: a pytree of the same structure; its shapes are enough.
     """
-    restored = []
-    for name, leaf in _named(like).items():
-        array = jax.numpy.array(tensors[name])
-        restored.append(jax.random.wrap_key_data(array) if _is_key(leaf) else array)
-    return cast(State, jax.tree.unflatten(jax.tree.structure(like), restored))
+
+    def restored(path: jax.tree_util.KeyPath, leaf: jax.Array) -> jax.Array:
+        array = jax.numpy.array(tensors[_STATE + jax.tree_util.keystr(path)])
+        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
+
+    return jax.tree.map_with_path(restored, like)
 
 
 def _named(tree: PyTree) -> dict[str, jax.Array]:
-    return {_STATE + jax.tree_util.keystr(x): leaf for x, leaf in jax.tree.leaves_with_path(tree)}
+    """The leaves by path, with PRNG keys as their data."""
+    leaves = {_STATE + jax.tree_util.keystr(x): leaf for x, leaf in jax.tree.leaves_with_path(tree)}
+    return {name: jax.random.key_data(x) if _is_key(x) else x for name, x in leaves.items()}
 
 
 def _is_key(leaf: jax.Array) -> bool:
     return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
-
-
-def _bare(leaves: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """The leaves, with PRNG keys as their data."""
-    return {name: jax.random.key_data(x) if _is_key(x) else x for name, x in leaves.items()}
 
 
 def _shapes(arrays: Mapping[str, np.ndarray | jax.Array]) -> dict[str, str]:
