@@ -77,17 +77,12 @@ def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
     Without it a jitted loop is compiled twice: its state comes back from devices on which it did
     not start, or is strongly typed where it was weakly typed.
     """
-    tree = jax.tree.map(_strongly_typed, tree)
+    # Copies, because a state whose arrays are shared cannot be donated; a given dtype is strong.
+    tree = jax.tree.map(lambda x: jnp.array(x, jnp.result_type(x)), tree)
     mesh = _mesh(num_devices)
     if mesh.size == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
-
-
-def _strongly_typed(x: Array | np.ndarray) -> Array:
-    x = jnp.array(x)  # a copy: a state whose arrays are shared cannot be donated
-    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
 
 def _mesh(num_devices: int | None) -> Mesh:
