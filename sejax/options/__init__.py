@@ -254,8 +254,7 @@ class Options:
         hints = hints_of(type(self), self.group)
         for field in dataclasses.fields(self):
             name = f"{self.group}.{field.name}".lstrip(".")
-            value = getattr(self, field.name)
-            value = checked(value, hints[field.name], name, field.default)
+            value = checked(getattr(self, field.name), hints[field.name], name, field.default)
             object.__setattr__(self, field.name, value)
 
 
