@@ -50,9 +50,8 @@ def start(
         is_known = configs_of or PRINT_CONFIG not in words
         require(is_known, PRINT_CONFIG, "is of sejax.run and sejax.evaluate alone. Leave it out.")
         overrides = [word for word in words if word not in (*HELP, PRINT_CONFIG)]
-        for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # as stderr; for terminals in ASCII
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
         Path.cwd()  # raises if the folder is gone
