@@ -89,9 +89,8 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
     classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]
     sources = dict[str, str]()
     for layer, values in layers.items():
-        sources |= dict.fromkeys(
-            config.in_words(values), "" if layer == "default" else f" ({layer})"
-        )
+        source = "" if layer == "default" else f" ({layer})"
+        sources |= dict.fromkeys(config.in_words(values), source)
     choices = (*command.groups(), *map(config.field_of, config.agents))
     fields = {name: x for name, x in config.in_words(config.plain()).items() if name not in choices}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
