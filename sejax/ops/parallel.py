@@ -182,16 +182,13 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
       >>> jax.vmap(square)(jnp.arange(3)).tolist()
       [0, 1, 4]
     """
-
-    @custom_vmap
-    def one(args: tuple[PyTree, ...]) -> T:
-        return fn(*args)
+    one = custom_vmap(fn)
 
     @one.def_vmap
-    def _(size: int, in_batched: list[PyTree], args: tuple[PyTree, ...]) -> tuple[T, PyTree]:
+    def _(size: int, in_batched: list[PyTree], *args: PyTree) -> tuple[T, PyTree]:
         def all_of_them(*args: PyTree) -> T:
             # None, which is no leaf, stands for an array that all elements share.
-            varied = jax.tree.map(lambda x, varies: x if varies else None, args, in_batched[0])
+            varied = jax.tree.map(lambda x, varies: x if varies else None, [*args], in_batched)
 
             def or_shared(x: Array | None, shared: Array) -> Array:
                 return shared if x is None else x
@@ -205,7 +202,7 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
         out = in_batches_on_cpu(all_of_them, outer_width)(*args)
         return out, jax.tree.map(lambda _: True, out)
 
-    return lambda *args: one(args) if on_cpu() else fn(*args)
+    return lambda *args: one(*args) if on_cpu() else fn(*args)
 
 
 def _deal(x: Array, num_devices: int) -> Array:
