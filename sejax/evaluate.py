@@ -100,8 +100,7 @@ def evaluate(config: EvaluateConfig) -> float:
     shown = summary if others else summary.droplevel("agent")
     fresh_agents.print_table(shown, title, f"{out_dir}/evaluation.csv holds every agent.")
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
-    texts = {world: summary.loc[world].to_json(orient="index") for world in worlds}
-    by_world = {world: json.loads(text) for world, text in texts.items()}
+    by_world = {x: json.loads(summary.loc[x].to_json(orient="index")) for x in worlds}
     write_text(out_dir / "evaluation.json", json.dumps(by_world, indent=2))
     return float(summary["test_return_mean"].loc[name].mean())
 
