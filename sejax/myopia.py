@@ -69,11 +69,16 @@ def judge(myopic: ArrayLike, far: ArrayLike, floor: ArrayLike, top: float) -> Ju
       floor: scores of agents that learned nothing, `[n]` or a number.
       top: score of agents that learned all.
 
+    Raises:
+      ValueError: if not as many agents are myopic as far-sighted.
+
     Example:
       >>> judge([98, 99, 97, 99, 98], [99, 98, 99, 99, 99], 20.0, 95.0).verdict
       'policy'
     """
-    far, floor = np.asarray(far, float), np.asarray(floor, float)
+    myopic, far, floor = (np.asarray(scores, float) for scores in (myopic, far, floor))
+    if myopic.shape != far.shape:
+        raise ValueError(f"myopic has the shape {myopic.shape}, far {far.shape}; seeds are paired")
     margin = MARGIN * (top - floor.mean())
     lost, gained = far - myopic, far - floor
     (low, high), (gain_low, gain_high) = mean_interval(lost), mean_interval(gained)

@@ -66,6 +66,8 @@ def test_as_many_more_agents_decide_as_are_said():
     assert judge(rn - 9000, rn, rn, 0.0).verdict == "teaches little"
     assert judge(rn - 9000, rn, rn - 3000, 0.0).verdict == "dynamics"
     assert few.verdict == "dynamics"
+    with pytest.raises(ValueError, match="seeds are paired"):
+        judge(myopic[:1], far, 0.0, 100.0)
     near = judge(np.tile([70.0, 100.0], 10), far, 0.0, 100.0)  # loses 15, the margin is 10
     assert near.verdict == "open"
     more = -(-(20 + near.missing) // 2)

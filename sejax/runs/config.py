@@ -1,12 +1,11 @@
 """The configuration of a bilevel optimisation: what `sejax.run` and `sejax.make_learner` take."""
 
 import contextlib
-import dataclasses
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from sejax import agents, envs
@@ -104,7 +103,7 @@ class LearnConfig(CommandConfig):
             weights = {key: given.get(key, 1.0) for key in self.agents}
             rule = "must have one above 0. Leave one of them out."
             require(any(weights.values()), "mixture.weights", rule)
-            object.__setattr__(self, "mixture", dataclasses.replace(self.mixture, weights=weights))
+            object.__setattr__(self, "mixture", replace(self.mixture, weights=weights))
         self.require_agents(self.env, self.proxy)
 
     @classmethod

@@ -1,10 +1,9 @@
 """Fresh agents on a stored proxy and on its real task, as in `sejax.evaluate` and `sejax.check`."""
 
 import contextlib
-import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -214,7 +213,7 @@ def _training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingC
         require("training" in proxy.config, "training_from", "must be config for this SE", use=use)
         test_episodes = config.real_training.test_episodes
         training = training_of(proxy, config.agents[key])
-        training = dataclasses.replace(training, test_episodes=test_episodes)
+        training = replace(training, test_episodes=test_episodes)
     config.require_learning(key, group, training, proxy.env.config, proxy.task)
     return training
 

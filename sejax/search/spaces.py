@@ -156,4 +156,8 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     foreign = [text for text in texts.values() if ":" in str(text)]
     fix = "Type this range on the command line."
     require(not foreign, "space", "must name no module", got=", ".join(map(str, foreign)), fix=fix)
-    return {str(field): parse(str(field), str(text)) for field, text in texts.items()}
+    try:
+        return {str(field): parse(str(field), str(text)) for field, text in texts.items()}
+    except ConfigError as error:
+        rule = f"must hold ranges; in {shortened(path, 40)} {error.field} {error.rule}"
+        raise ConfigError("space", rule, fix=f"Write {EXAMPLE} there.") from error
