@@ -35,12 +35,7 @@ def _rational_tanh(
         square = x * x
         return x * _polynomial(numerator, square) / _polynomial(denominator, square)
 
-    @tanh.defjvp
-    def jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        (x,), (dx,) = primals, tangents
-        y = tanh(x)
-        return y, (1 - y * y) * dx  # autodiff of a quotient costs more
-
+    tanh.defjvps(lambda dx, y, x: (1 - y * y) * dx)  # autodiff of a quotient costs more
     return tanh
 
 
