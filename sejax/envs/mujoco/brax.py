@@ -1,5 +1,7 @@
 """HalfCheetah on brax."""
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from brax.base import State as BraxState
 from brax.envs.base import State
@@ -8,7 +10,9 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
-from sejax.envs.mujoco.tasks import HalfCheetah
+
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import HalfCheetah
 
 # Iterations of mjx's line search; MuJoCo has 50. Under vmap all wait for the longest search. Gaits
 # earn as much with 10 iterations as with 50, but less with 8.
@@ -35,7 +39,7 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
     Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
     """
 
-    def __init__(self, config: HalfCheetah):
+    def __init__(self, config: "HalfCheetah"):
         super().__init__(config.spec)
         self._info_keys = config.spec.info_keys
         self._brax = Halfcheetah(backend=config.backend)
