@@ -130,7 +130,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
 # --- module:attribute ----------------------------------------------------------------------------
 
 SEVERAL = """
-import dataclasses
+import dataclasses, functools
 import sejax
 from sejax.es.nes import NESConfig
 
@@ -157,14 +157,14 @@ too_few = lambda: 3
 def unsized(task, size: int = "large"): return 3
 of_any = lambda task, *values, **more: 3
 Named = dataclasses.make_dataclass("Named", ["name"], namespace={"make": staticmethod(wrong)})
+Swapped = dataclasses.make_dataclass("Swapped", [], namespace={"make": lambda self: 3})
+
+class Decorated(Scaled):
+    make = functools.wraps(too_few)(lambda self, task: Scaled.make(self, task))
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
     scale: "Unknown" = 2.0
-
-class Swapped(Plain):
-    def make(self):
-        return None
 
 class Vague(Plain):
     def make(self, task):
@@ -184,7 +184,7 @@ def task(sizes: list[int] = [1, 2], length: float = None) -> 'sejax.Task':
 @pytest.mark.parametrize(("attribute", "values"), [
     ("Scaled", {"scale": 3.0, "needed": 1}), ("Outer.Inner", {"scale": 2.0, "needed": 1}),
     ("scaled", {"scale": 3.0, "offset": 0.0, "steps": (4,), "also": [3]}),
-    ("unknown", {"scale": 2.0}),  # no known return type
+    ("Decorated", {"needed": 1}), ("unknown", {"scale": 2.0}),  # no known return type
 ])  # fmt: skip
 def test_a_dataclass_or_a_function_of_ones_own_is_found_by_its_module_and_name(
     module, attribute, values

@@ -52,7 +52,8 @@ class DDQNConfig(OffPolicyOptions):
 
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        return DDQN(self, task.obs_dim, task.action_dim).agent()
+        assert task.num_actions is not None
+        return DDQN(self, task.obs_dim, task.num_actions).agent()
 
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""

@@ -82,7 +82,8 @@ class DiscreteTD3Config(TD3Config):
     one_hot_actions: bool = False
 
     def make(self, task: Task) -> Agent:
-        return DiscreteTD3(self, task.obs_dim, task.action_dim).agent()
+        assert task.num_actions is not None
+        return DiscreteTD3(self, task.obs_dim, task.num_actions).agent()
 
     def mlp(self, num_outputs: int) -> MLP:
         return super().mlp(num_outputs).clone(layer_norm=self.layer_norm)

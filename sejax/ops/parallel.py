@@ -182,7 +182,7 @@ def in_batches_on_cpu(fn: Callable[..., T], width: int | None) -> Callable[..., 
       >>> jax.vmap(square)(jnp.arange(3)).tolist()
       [0, 1, 4]
     """
-    one = custom_vmap(fn)
+    one = custom_vmap(lambda *args: fn(*args))  # by itself `fn` would have its defaults traced
 
     @one.def_vmap
     def _(size: int, in_batched: list[PyTree], *args: PyTree) -> tuple[T, PyTree]:

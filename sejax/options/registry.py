@@ -191,10 +191,11 @@ def _can_make(group: str, plugin: type, base: type) -> bool:
     """Whether a class has its own `make`, which takes the group's arguments."""
     make = inspect.getattr_static(plugin, "make", None)
     is_own = make is not inspect.getattr_static(base, "make", None)
-    if not inspect.isfunction(make):  # such as a static method or a property
+    is_field = "make" in inspect.getattr_static(plugin, "__dataclass_fields__")
+    if is_field or not inspect.isfunction(make):  # such as a static method or a property
         return is_own
-    try:
-        inspect.signature(make).bind(None, *GROUPS[group].arguments)
+    try:  # of what is called: what a decorator wraps may take other arguments
+        inspect.signature(make, follow_wrapped=False).bind(None, *GROUPS[group].arguments)
     except TypeError:
         return False
     return is_own

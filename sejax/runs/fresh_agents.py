@@ -181,7 +181,7 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
         task = envs.make_from(configure("env", {**fields, "name": config.env}))
     if (name := config.proxy_kind) is not None:
-        is_own = name == learned.kind or not registry.is_registered("proxy", name)
+        is_own = name == learned.kind or name not in registry.BUILT_IN["proxy"]
         require(is_own, "proxy_kind", "must be the proxy's class", got=name, use=learned.kind)
         proxy_config = configure("proxy", {**stored["proxy"], "name": name}, "proxy_kind")
     proxy = load_proxy(path, task, proxy_config, "proxy")

@@ -32,6 +32,8 @@ Tree: TypeAlias = dict[str, Any]  # nested plain values
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
+# First parts of the names of fields that have dots.
+GROUPS = {*registry.GROUPS, "agents", "mixture", "training", "real_training"}
 CHOOSE_ALL = {"agent", "agents"}  # words that choose all agents
 # `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
 BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
@@ -56,11 +58,13 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
         name, equals, text = override.partition("=")
         if not (equals and NAME.fullmatch(name)):
             field, _, after = name.strip("-. ").partition(" ")
+            if not NAME.fullmatch(field):  # such as a path with spaces
+                field, after = name.strip("-. "), ""
             field = shortened(field or "NAME")
             is_choice = any(registry.is_registered(group, field) for group in registry.GROUPS)
-            is_name = bool(NAME.fullmatch(field)) and not is_choice
-            is_field = name.startswith("-") or name.partition(".")[0] in registry.GROUPS or is_name
-            value = f"{field}={shortened((text or after).strip()) or 'VALUE'}"
+            is_name = field.isascii() and field.isidentifier() and not is_choice
+            is_field = name.startswith("-") or field.partition(".")[0] in GROUPS or is_name
+            value = f"{field}={shortened((after or text).strip()) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
@@ -93,8 +97,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     typed = _tree(texts, groups)
     try:
         text = path.read_text(encoding="utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise ValueError("it has aliases")  # a few lines of which can make billions of values
+        require_small(text)
         values = flatten(yaml.safe_load(text))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         drop_other_choices(file, typed, groups)
@@ -104,6 +107,21 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     except UNREADABLE as error:
         rule = f"must be a name or a YAML file; got {shortened(path, 40)} ({shortened(error)})"
         raise ConfigError("preset", rule, use="best") from error
+
+
+def require_small(text: str) -> None:
+    """Raises `ValueError` for YAML whose aliases stand for values with aliases.
+
+    A few lines of these can make billions of values; other aliases are as long as the file.
+    """
+    anchors: list[bool] = []  # of the open collections
+    for event in yaml.parse(text):
+        if isinstance(event, yaml.CollectionStartEvent):
+            anchors.append(event.anchor is not None)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchors.pop()
+        elif isinstance(event, yaml.AliasEvent) and any(anchors):
+            raise ValueError("it has aliases within what has an anchor")
 
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:

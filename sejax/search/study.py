@@ -64,8 +64,9 @@ def open_study(plan: StudyPlan) -> optuna.Study:
         )
         try:
             for trial in study.get_trials(deepcopy=False):  # reads all of it
-                scores = trial.intermediate_values
-                if trial.state == TrialState.COMPLETE and trial.value != scores[budgets[1]]:
+                # A trial that was told by hand may have no scores of generations.
+                score = trial.intermediate_values.get(budgets[1], trial.value)
+                if trial.state == TrialState.COMPLETE and trial.value != score:
                     raise ValueError(f"trial {trial.number} has two scores")
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
@@ -229,7 +230,8 @@ def _computed(trial: Trial, plan: StudyPlan) -> str:
             break
     trial.set_user_attr("generations", progress.generations)
     trial.set_user_attr("train_steps", progress.train_steps)
-    score = float(progress.scores[-1])
+    # Of a trial that was killed before it was told, the first score is kept.
+    score = reported.get(rung, float(progress.scores[-1]))
     if rung == last and np.isfinite(score):
         study.tell(trial, score)
     else:
