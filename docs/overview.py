@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from experiments import null_baselines
@@ -107,15 +108,18 @@ def draw_costs(axes: Axes) -> None:
                 mark, fill = MARKERS[row.kind]
                 spot = row.real_steps, row.test_return_mean
                 axes.plot(*spot, mark, color=COLORS[name], mfc=fill or COLORS[name], ms=8)
-    for name, color in COLORS.items():
-        axes.plot([], [], "s", color=color, label=name)
-    for label, (mark, fill) in zip(("DDQN", "discrete TD3"), MARKERS.values(), strict=True):
-        axes.plot([], [], mark, color="black", mfc=fill or "black", label=label)
+    ses = [Line2D([], [], ls="", marker="s", color=x, label=name) for name, x in COLORS.items()]
+    agents = [
+        Line2D([], [], ls="", marker=mark, color="black", mfc=fill or "black", label=label)
+        for label, (mark, fill) in zip(("DDQN", "discrete TD3"), MARKERS.values(), strict=True)
+    ]
     axes.axhline(195, color="black", linestyle="--", linewidth=0.8)
     axes.text(4e7, 193, "solved", ha="right", va="top", fontsize=8)
-    axes.set(xscale="log", xlim=(1e3, 5e7), ylim=(0, 210))
+    axes.set(xscale="log", xlim=(1e3, 5e7), ylim=(120, 205))
     axes.set(xlabel="real steps to make the SE", ylabel="return on the real CartPole")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    shared = {"frameon": False, "fontsize": 8, "title_fontsize": 8, "alignment": "left"}
+    axes.add_artist(axes.legend(handles=agents, title="agents", loc=(0.45, 0.33), **shared))
+    axes.legend(handles=ses, title="SEs", loc="lower right", **shared)
     axes.spines[["top", "right"]].set_visible(False)
 
 
