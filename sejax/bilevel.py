@@ -146,9 +146,9 @@ class Bilevel:
         # XLA must not fuse the sums below into the program of the outcome: they would round
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
-        scores, mean_score = self.scoring.search_scores(outcome)
+        scores, incumbent_score = self.scoring.search_scores(outcome)
         es_state = self.layout.strategy.tell(
-            candidates.key_tell, candidates.population, scores, mean_score, candidates.es_state
+            candidates.key_tell, candidates.population, scores, incumbent_score, candidates.es_state
         )
         shown = self.scoring.shown_scores(outcome)
         measured = ScoredProxy(
@@ -175,7 +175,10 @@ def make_learner(
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
-    `jax.jit` makes it one executable with the scan inside; `vmap` over keys makes several runs.
+    `jax.jit` makes it one executable with the scan inside; `vmap` over keys makes several runs:
+    each device then trains its part of the agents of every run, until the slowest has ended. The
+    numbers are those of separate runs up to rounding.
+
     With `proxy = config.parts()["proxy"]` agents train on `proxy, proxy.params(result.weights)`,
     and `sejax.save(path, proxy, result.weights)` keeps what was learned.
 

@@ -389,7 +389,7 @@ def evaluate_agents(
     return program(keys, env_params)
 
 
-@functools.lru_cache(maxsize=64, typed=True)  # True, which is no number of devices, is not 1
+@functools.lru_cache(maxsize=64, typed=True)  # `devices=True` is not 1: it must raise
 def _evaluation_program(
     agent: Agent,
     env: Environment,

@@ -20,7 +20,7 @@ from sejax.options import MOST, Count, NonNegative, Options, require
 
 
 class Outcome(struct.PyTreeNode):
-    """The result of one agent. Leaves are `[]`, returns `[episode]`; `[agent, ...]` for many.
+    """The result of one agent. Leaves are `[]`, returns `[episode]`; `[training, ...]` for many.
 
     Attributes:
       test_returns: return of each test episode on the real task, in reward units.
@@ -34,16 +34,16 @@ class Outcome(struct.PyTreeNode):
       real_steps: steps on the real task: tests, and training where its dynamics are real.
     """
 
-    test_returns: Float[Array, "*agent episode"]
-    scored_returns: Float[Array, "*agent episode"]
-    train_steps: Int[Array, "*agent"]
-    train_episodes: Int[Array, "*agent"]
-    auc: Float[Array, "*agent"]
-    nonfinite: Bool[Array, "*agent"]
-    real_steps: Int[Array, "*agent"]
+    test_returns: Float[Array, "*training episode"]
+    scored_returns: Float[Array, "*training episode"]
+    train_steps: Int[Array, "*training"]
+    train_episodes: Int[Array, "*training"]
+    auc: Float[Array, "*training"]
+    nonfinite: Bool[Array, "*training"]
+    real_steps: Int[Array, "*training"]
 
     @property
-    def test_return(self) -> Float[Array, "*agent"]:
+    def test_return(self) -> Float[Array, "*training"]:
         """Mean over the test episodes."""
         return self.test_returns.mean(axis=-1)
 
@@ -53,8 +53,8 @@ class Objective:
     """What the outer loop maximises.
 
     Attributes:
-      score: `outcome -> [agent]` float32, leaves of the outcome `[agent, ...]`. A training that
-        diverged gets nan, whatever this function returns.
+      score: `outcome -> [training]` float32, leaves of the outcome `[training, ...]`. A training
+        that diverged gets nan, whatever this function returns.
       needs_tests: whether it uses tests between training episodes. Then agents are tested after
         each episode, and solving the task ends no training.
       scores_are_returns: whether scores are mean returns, comparable with the task's solved reward.
@@ -66,15 +66,15 @@ class Objective:
       meaning: what a score means, for people.
     """
 
-    score: Callable[[Outcome], Float[Array, "*agent"]]
+    score: Callable[[Outcome], Float[Array, "*training"]]
     needs_tests: bool = False
     scores_are_returns: bool = False
-    shown: Callable[[Outcome], Float[Array, "*agent"]] | None = None
+    shown: Callable[[Outcome], Float[Array, "*training"]] | None = None
     test_env: Callable[[Environment], Environment] = lambda env: env
     test_params: Callable[[Array], PyTree] = lambda generation: None
     meaning: str = ""
 
-    def search_scores(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def search_scores(self, outcome: Outcome) -> Float[Array, "*training"]:
         """The scores that compare candidates; nan for diverged agents.
 
         Raises:
@@ -82,7 +82,7 @@ class Objective:
         """
         return _checked(self.score(outcome), outcome.nonfinite)
 
-    def shown_scores(self, outcome: Outcome) -> Float[Array, "*agent"]:
+    def shown_scores(self, outcome: Outcome) -> Float[Array, "*training"]:
         """The scores that people see; nan for diverged agents.
 
         Raises:
@@ -91,7 +91,7 @@ class Objective:
         return _checked((self.shown or self.score)(outcome), outcome.nonfinite)
 
 
-def _checked(scores: Array, nonfinite: Bool[Array, "*agent"]) -> Float[Array, "*agent"]:
+def _checked(scores: Array, nonfinite: Bool[Array, "*training"]) -> Float[Array, "*training"]:
     """The scores, with nan for diverged agents.
 
     A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.

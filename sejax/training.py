@@ -313,8 +313,8 @@ class _Loop:
     def train(self, key: Array, env_params: PyTree, hparams: Hparams, active: Array) -> TrainResult:
         """One training."""
         if (proxy := proxy_in(self.env)) is not None:
-            discount = self.agent.discount(hparams)
-            env_params = proxy.prepare(env_params, discount, self.limit_is_terminal)
+            gamma = self.agent.discount(hparams)
+            env_params = proxy.prepare(env_params, gamma, self.limit_is_terminal)
         key_begin, key_steps = jax.random.split(key)
         state = self.begin(key_begin, env_params, hparams, active)
         buffer = self.buffer(state)
@@ -380,7 +380,7 @@ class _Loop:
     def rollout(
         self, buffer: Buffer, large: PyTree, state: _LoopState, consts: _Consts, masked: bool
     ) -> tuple[PyTree, _LoopState]:
-        """Fills the buffer and learns from it. A training that ends before learns nothing.
+        """Fills the buffer and learns from it. If the training ends before, it learns nothing.
 
         With `learns_every=3` an iteration is step, step, step, learn. Each `step` is masked, since
         the training may end at the first or second one.

@@ -94,9 +94,9 @@ class AgentSpec:
       warmup_episodes: initial episodes in which no stop rule may end the training.
       learns_from: first episode, counted from 0, in which the agent learns.
       action_repeat: environment steps for each decision.
-      cpu_num_parallel: `vmap` width on one CPU core; None for all agents, where a `num_parallel` of
-        None means this width. One wide network keeps a core busy; a table, or a narrow network,
-        does not.
+      cpu_num_parallel: agents in a vmapped batch of a CPU core, unless the user sets
+        `num_parallel`; None for all of them. One wide network keeps a core busy; a table, or a
+        narrow network, does not.
       sizes: `sizes_of` the spaces that the agent is made for, set by `sejax.make_agent`; None if
         unknown.
     """

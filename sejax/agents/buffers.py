@@ -239,8 +239,8 @@ def sample(
     Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
     """
     width = rows.shape[1]
-    step = cpu.VECTOR if in_use is None else block_size(batch_size)
-    padded_size = -(-batch_size // step) * step
+    multiple = cpu.VECTOR if in_use is None else block_size(batch_size)
+    padded_size = -(-batch_size // multiple) * multiple
     index = sample_indices(seed, jnp.minimum(num_stored, rows.shape[0]), padded_size)
     batch = jax.lax.platform_dependent(
         rows.reshape(-1),

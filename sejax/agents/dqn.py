@@ -19,7 +19,7 @@ from pydantic import Field
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicy, OffPolicyOptions, adam_step
-from sejax.agents.policies import decayed_epsilon, epsilon_greedy, q_of_action
+from sejax.agents.policies import decayed_epsilon, epsilon_greedy, value_of_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.networks import DuelingMLP, init_narrowed
@@ -103,7 +103,7 @@ class DDQNState(struct.PyTreeNode):
     target_params: PyTree
     opt_state: optax.OptState
     epsilon: Array
-    num_steps: Int[Array, ""]  # agent steps since it first learned
+    num_updates: Int[Array, ""]  # learning steps so far
     hparams: Hparams
 
 
@@ -133,7 +133,7 @@ class DDQN(OffPolicy):
             target_params=params,
             opt_state=ADAM.init(params),
             epsilon=hparams.epsilon_init,
-            num_steps=jnp.int32(0),
+            num_updates=jnp.int32(0),
             hparams=hparams,
         )
 
@@ -167,28 +167,28 @@ class DDQN(OffPolicy):
             next_q = self.q_values(params, batch.next_obs) if self.config.double else target_next_q
             discount = hp.discount * batch.discount
             next_action = jnp.argmax(next_q, axis=0)
-            targets = batch.reward + discount * q_of_action(target_next_q, next_action)
-            predicted = q_of_action(self.q_values(params, batch.obs), batch.action)
+            targets = batch.reward + discount * value_of_action(target_next_q, next_action)
+            predicted = value_of_action(self.q_values(params, batch.obs), batch.action)
             return jnp.sum(batch.weight * (predicted - jax.lax.stop_gradient(targets)) ** 2)
 
         params, opt_state = adam_step(sum_of_losses, state.params, state.opt_state, (batch,), hp)
-        num_steps = state.num_steps + 1
+        num_updates = state.num_updates + 1
         steps_decide = hp.exploration_steps is not None
         return state.replace(
             params=params,
             target_params=optax.incremental_update(params, state.target_params, hp.tau),
             opt_state=opt_state,
-            num_steps=num_steps,
-            epsilon=linear_epsilon(hp, num_steps) if steps_decide else state.epsilon,
+            num_updates=num_updates,
+            epsilon=linear_epsilon(hp, num_updates) if steps_decide else state.epsilon,
         )
 
 
-def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
-    """The share of random actions `num_steps` after the agent first learned, `[]`.
+def linear_epsilon(hparams: Hparams, num_updates: Array) -> Array:
+    """The share of random actions after `num_updates` learning steps, `[]`.
 
     It falls from `hparams.epsilon_init` to `epsilon_min` in `exploration_steps`, and stays there.
 
     Source: Mnih et al. (2015), extended data table 1 (final exploration frame).
     """
-    progress = jnp.minimum(num_steps / hparams.exploration_steps, 1.0)
+    progress = jnp.minimum(num_updates / hparams.exploration_steps, 1.0)
     return hparams.epsilon_init + progress * (hparams.epsilon_min - hparams.epsilon_init)

@@ -112,7 +112,7 @@ class Mixture:
             behind = shares * (candidate + 1) - [len(hand) for hand in hands]
             hands[int(np.argmax(behind))].append(candidate)
         are_enough = all(hand for hand, share in zip(hands, shares, strict=True) if share > 0)
-        # Enough in any case. Of mirrored vectors, as evosax counts, half as many are dealt.
+        # Enough in any case: doubled, as half of a mirrored population is dealt.
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
         rule = f"must be larger: {num_candidates} candidates do not suffice for the agents' shares"
         require(are_enough, "es.population_size", rule, use=size)

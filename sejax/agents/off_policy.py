@@ -99,11 +99,11 @@ class ActorCritic(OffPolicy):
     max_action: float = 1.0
 
     def __post_init__(self) -> None:
-        num_outputs, self.num_action_inputs, num_values = self.sizes()
+        num_outputs, self.num_action_inputs, num_values = self.network_sizes()
         self.actor = self.config.mlp(num_outputs)
         self.critic = self.config.mlp(num_values)
 
-    def sizes(self) -> tuple[int, int, int]:
+    def network_sizes(self) -> tuple[int, int, int]:
         """Outputs of the actor, inputs of a critic beside the observation, and its outputs.
 
         Here for an actor with a number for each action, and critics that see the action and give
@@ -145,7 +145,7 @@ def adam_step(
       hparams: `learning_rate`, and `batch_size` in use or None.
     """
     total = sum_over_batch(
-        lambda columns: jax.grad(sum_of_losses)(params, *columns), columns, hparams.batch_size
+        lambda block: jax.grad(sum_of_losses)(params, *block), columns, hparams.batch_size
     )
     count = num_columns(columns[0])
     gradient = jax.tree.map(lambda x: x / count, total)

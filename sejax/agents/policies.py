@@ -8,17 +8,17 @@ from sejax.agents.base import Hparams
 from sejax.ops.keys import unit_interval
 
 
-def q_of_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
-    """Q of each column's own action; or, of log probabilities in place of Q, the action's.
+def value_of_action(values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
+    """The value, such as Q or a log probability, of each column's own action.
 
-    It chooses nothing. It reads by mask: gathers and their gradients are slow on CPU.
+    It is read by mask: gathers and their gradients are slow on CPU.
 
     Args:
-      q_values: a number for each action, in each column.
+      values: a number for each action, in each column.
       action: `[batch]` indices.
     """
-    mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
-    return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)
+    mask = jnp.arange(values.shape[0])[:, None] == action[None, :]
+    return jnp.sum(jnp.where(mask, values, 0.0), axis=0)
 
 
 def decayed_epsilon(hparams: Hparams, episode: Array) -> Array:

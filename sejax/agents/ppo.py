@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentOptions, AgentSpec, Algorithm, Hparams
 from sejax.agents.buffers import BufferMaker, Rollout, Transition, rollout_buffer
-from sejax.agents.policies import q_of_action
+from sejax.agents.policies import value_of_action
 from sejax.envs.base import Task
 from sejax.ops import cpu
 from sejax.ops.keys import murmur
@@ -328,7 +328,7 @@ class PPO(Algorithm):
         """The logarithms of the actions' probabilities, and the entropies, in nats."""
         log_probs = jax.nn.log_softmax(outputs, axis=0)
         entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
-        return q_of_action(log_probs, action), entropy
+        return value_of_action(log_probs, action), entropy
 
 
 class ContinuousPPO(PPO):

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import ActorCritic, ActorCriticOptions, adam_step
-from sejax.agents.policies import q_of_action
+from sejax.agents.policies import value_of_action
 from sejax.envs.base import Task
 from sejax.ops.optimizers import ADAM
 from sejax.options import Finite, Fraction, NonNegative, Positive, option, require
@@ -187,7 +187,7 @@ class SAC(ActorCritic):
 
     # Methods that discrete actions override.
 
-    def sizes(self) -> tuple[int, int, int]:
+    def network_sizes(self) -> tuple[int, int, int]:
         return 2 * self.action_dim, self.action_dim, 1
 
     def target_entropy(self, hparams: Hparams) -> Array:
@@ -201,7 +201,7 @@ class SAC(ActorCritic):
     def sample(self, key: Array, outputs: Array, is_uniform: Array) -> Array:
         """An action of the policy, or a uniform one, for one observation."""
         noise = jax.random.normal(key, (self.action_dim,))
-        uniform = jax.lax.erf(noise / math.sqrt(2))  # 2 F(noise) - 1, F the normal distribution
+        uniform = jax.lax.erf(noise / math.sqrt(2))  # the same noise made uniform: 2 F(noise) - 1
         return jnp.where(is_uniform, uniform, squashed_gaussian(outputs, noise)[0])
 
     def best(self, outputs: Array) -> Array:
@@ -235,7 +235,7 @@ class DiscreteSAC(SAC):
     is the number of actions.
     """
 
-    def sizes(self) -> tuple[int, int, int]:
+    def network_sizes(self) -> tuple[int, int, int]:
         return self.action_dim, 0, self.action_dim
 
     def target_entropy(self, hparams: Hparams) -> Array:
@@ -251,7 +251,7 @@ class DiscreteSAC(SAC):
         return jnp.argmax(outputs).astype(jnp.int32)
 
     def q_values(self, critics: PyTree, obs: Array, action: Array) -> Float[Array, "2 batch"]:
-        return jax.vmap(q_of_action, (0, None))(self.critic_outputs(critics, obs), action)
+        return jax.vmap(value_of_action, (0, None))(self.critic_outputs(critics, obs), action)
 
     def expected(
         self, critics: PyTree, obs: Array, outputs: Array, noise: Array | None

@@ -118,7 +118,7 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
     variants = [make(dataclasses.replace(config, **batch, **network)) for network in networks]
 
     def draw(key: Array) -> Drawn:
-        key = jax.random.fold_in(key, 0x48_50)  # whose `split` makes the training and test keys
+        key = jax.random.fold_in(key, 0x48_50)  # the key itself is split for training and tests
         drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())
         values = dict(zip(ranges, drawn, strict=True))
         traced = {name: x for name, x in values.items() if name != "num_layers"}
@@ -126,7 +126,8 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
         depth = values.get("num_layers", jnp.zeros(()))
         units = values.get("hidden_size", jnp.zeros(()))
         too_small = [(n < depth) | ((n == depth) & (size < units)) for n, size in shapes]
-        return Drawn(jnp.int32(sum(too_small)), hparams, values)  # the smallest that has room
+        # So many are too small: the index of the smallest that has room.
+        return Drawn(jnp.int32(sum(too_small)), hparams, values)
 
     spec = agent.spec
     if len(variants) > 1:  # under vmap all branches would run

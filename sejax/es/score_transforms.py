@@ -29,7 +29,7 @@ def linear(scores: PerCandidate, incumbent: Float[Array, ""]) -> PerCandidate:
 
     Args:
       scores: `[pop]`, of each candidate, in the objective's unit.
-      incumbent: not used.
+      incumbent: the incumbent's score; not used.
 
     Returns:
       `[pop]` weights; all 0 if all scores are equal.
@@ -113,8 +113,8 @@ def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
         return TRANSFORMS[choice]
     function = registry.imported(FIELD, choice) if isinstance(choice, str) else choice
     for scores in (np.arange(pop, dtype=np.float32), np.zeros(pop, np.float32)):
-        told = foreign_code(FIELD, f"must take scores in jax; {choice}")
-        with told, jax.ensure_compile_time_eval():
+        guarded = foreign_code(FIELD, f"must take scores in jax; {choice}")
+        with guarded, jax.ensure_compile_time_eval():
             weights = np.asarray(jax.jit(function)(scores), float)
         is_fit = weights.shape == (pop,) and np.isfinite(weights).all()
         rule = f"must give {pop} finite weights for {pop} scores"
@@ -143,12 +143,12 @@ def _scaled_utilities(scores: PerCandidate, subtracted: float) -> PerCandidate:
 
     Before the subtraction they sum to 1, and a score that is not finite has 0, whatever its rank.
     """
-    ranked = or_minus_inf(scores)
-    best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)
-    utilities = jnp.maximum(0.0, jnp.log(scores.shape[0] / 2 + 1) - jnp.log(best_is_one))
+    sortable = or_minus_inf(scores)
+    ranks = 1 + (sortable[None, :] > sortable[:, None]).sum(axis=1)
+    utilities = jnp.maximum(0.0, jnp.log(scores.shape[0] / 2 + 1) - jnp.log(ranks))
     utilities = jnp.where(jnp.isfinite(scores), utilities, 0.0)
     utilities = _safe_divide(utilities, utilities.sum()) - subtracted
-    utilities = jnp.where(ranked.max() > ranked.min(), utilities, 0.0)
+    utilities = jnp.where(sortable.max() > sortable.min(), utilities, 0.0)
     return _safe_divide(utilities, jnp.abs(utilities).max())
 
 

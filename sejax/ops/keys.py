@@ -64,7 +64,7 @@ def unit_interval(bits: UInt32[Array, "*shape"]) -> Float[Array, "*shape"]:
 def _mix(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
     """A bijection of 32 bits in which each bit of the input moves about half of the output.
 
-    It is no `murmur`, as all numbers were made with it.
+    Kept beside `murmur`: another hash would move every stored number.
 
     Source: C. Wellons, "Prospecting for hash functions" (2018), lowbias32.
     """

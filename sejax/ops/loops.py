@@ -122,7 +122,7 @@ def _while_any_active(
         def broadcast(batched: bool, x: PyTree) -> PyTree:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
-        # The deeper loop captures anew what is the same for all elements.
+        # Without `args[3]`: the deeper loop finds again what its body captures.
         out = _while_any_active(
             body, depth + 1, per_check, *jax.tree.map(broadcast, in_batched[:3], list(args[:3]))
         )

@@ -29,11 +29,11 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
         new["agents"] = {registry.key_of(agent["name"]): new.pop("agent")}
     agents = new.setdefault("agents", {})
     if isinstance(agents, Mapping) and "mixture" not in new:
-        new |= _without_mixture(agents)
+        new |= _split_mixture(agents)
     return new
 
 
-def _without_mixture(agents: Mapping[str, Any]) -> dict[str, Any]:
+def _split_mixture(agents: Mapping[str, Any]) -> dict[str, Any]:
     """The agents, and beside them the settings of their mixture that stood among them."""
     of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
     by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}

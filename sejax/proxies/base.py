@@ -68,10 +68,10 @@ class ProxyConfig(Options, ABC):
           ConfigError: if it is not.
         """
 
-    def _error(self, name: str, value: object, why: str) -> ConfigError:
-        """Error for a field with one allowed value; in the message `why` follows that value."""
+    def _error(self, name: str, value: object, tail: str) -> ConfigError:
+        """Error for a field with one allowed value; in the message `tail` follows that value."""
         only = as_text(value)
-        rule = f"must be {only} {shortened(why, 120)}"
+        rule = f"must be {only} {shortened(tail, 120)}"
         return ConfigError(f"{self.group}.{name}", rule, got=as_text(getattr(self, name)), use=only)
 
     @abstractmethod

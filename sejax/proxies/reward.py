@@ -230,14 +230,14 @@ class RewardEnv(ProxyEnv):
         obs, env_state, real_reward, terminated, info = self.task.env.step_env(
             key, state.env_state, action, self.task.params
         )
-        vector = _select(info, self._augmented_keys)
+        augmentation = _select(info, self._augmented_keys)
         next_state = RewardState(
-            env_state=env_state, obs=obs, augmentation=vector, time=state.time + 1
+            env_state=env_state, obs=obs, augmentation=augmentation, time=state.time + 1
         )
         if self.config.shaping.weighs_info:
             bonus = params.weights["info_weights"] @ _select(info, self.task.info_keys)
         else:
-            bonus = self.potential(params, obs, vector)
+            bonus = self.potential(params, obs, augmentation)
             if self.config.zero_at_terminal:
                 is_cut = self.is_truncated(next_state, params)
                 bonus = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, bonus)

@@ -207,8 +207,8 @@ class SyntheticEnv(ProxyEnv):
         # "start" always takes a key, so that stored runs keep their numbers.
         keys = jax.random.split(key, len(self._networks.keys() | {"start"}))
         return {
-            name: self._net(name).init(network_key, jnp.zeros(units[0]))["params"]
-            for network_key, (name, units) in zip(keys, self._networks.items(), strict=False)
+            name: self._net(name).init(network_key, jnp.zeros(widths[0]))["params"]
+            for network_key, (name, widths) in zip(keys, self._networks.items(), strict=False)
         }
 
     def _net(self, name: str) -> MLP:
@@ -253,8 +253,8 @@ class SyntheticEnv(ProxyEnv):
         if self.task.num_actions is None:  # the networks never learned beyond the bounds
             action = jnp.clip(action, -self.task.max_action, self.task.max_action)
         vector, reward, done = map(jnp.float32, self.predict(params.weights, state.vector, action))
-        size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
-        is_sane = size < MAX_ABS_VALUE  # False for nan
+        largest = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
+        is_sane = largest < MAX_ABS_VALUE  # False for nan
         state = SyntheticState(vector=jnp.where(is_sane, vector, state.vector), time=state.time + 1)
         may_end = state.time >= self.config.min_steps
         ends = (self.ends(key, done) & may_end) | ~is_sane
@@ -263,7 +263,7 @@ class SyntheticEnv(ProxyEnv):
         discount = soft if self.config.done == "soft" else 1.0 - ends
         info = {
             "discount": jnp.where(is_sane & ~at_horizon, discount, 0.0),
-            "nonfinite": ~jnp.isfinite(size),
+            "nonfinite": ~jnp.isfinite(largest),
         }
         return self.observe(state), state, jnp.where(is_sane, reward, 0.0), ends | at_horizon, info
 

@@ -72,14 +72,14 @@ def preset_of(typed: Tree) -> Tree:
     default = {"objective": {"name": registry.find("proxy", proxy).default_objective}}
     objective = chosen(merge(default, section, typed), "objective")
     of_names = section.get("with_agent", {})
-    beside = {key: of_names.get(x, {}) for key, x in agent_names(typed["agents"]).items()}
+    by_key = {key: of_names.get(x, {}) for key, x in agent_names(typed["agents"]).items()}
     settings = merge(
         {key: x for key, x in section.items() if not key.startswith("with_")},
         section.get("with_es", {}).get(es, {}),
         section.get("with_objective", {}).get(objective, {}),
-        *(beside.values() if len(beside) == 1 else ()),
+        *(by_key.values() if len(by_key) == 1 else ()),
         {"objective": {"name": objective}, "preset": name},
-        {"agents": {key: x.get("agent", {}) for key, x in beside.items()}},
+        {"agents": {key: x.get("agent", {}) for key, x in by_key.items()}},
     )
     # The fields of an only agent, which stand under its key too.
     return {key: x for key, x in settings.items() if key != "agent"}

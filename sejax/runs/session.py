@@ -68,11 +68,11 @@ def run(
             length = min(config.checkpoint_every, config.generations - first)
             state, info = _advance(chunks, state, length, report)
             with interrupts_held():
-                saved, info = jax.device_get((state, info))
+                on_host, info = jax.device_get((state, info))
                 wall_s = earlier_wall_s + time.monotonic()
                 cpu_s = earlier_cpu_s + time.process_time() + chunks.cpu_s
-                rows = directory.save(saved, info, wall_s, cpu_s)
-                save_proxies(directory, bilevel, saved, first)
+                rows = directory.save(on_host, info, wall_s, cpu_s)
+                save_proxies(directory, bilevel, on_host, first)
             for generation in _finished(rows, info):
                 report.on_generation(generation)
                 tracker.on_generation(generation)

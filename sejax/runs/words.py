@@ -32,8 +32,8 @@ Tree: TypeAlias = dict[str, Any]  # nested plain values
 NAME = re.compile(r"[A-Za-z_][\w.-]*")  # a field's name
 # A choice may stand beside its fields, as in config.yaml.
 CHOICES = {f"{group}.name": group for group in registry.GROUPS}
-# First parts of the names of fields that have dots.
-GROUPS = {*registry.GROUPS, "agents", "mixture", "training", "real_training"}
+# First parts of fields' names that have dots.
+DOTTED = {*registry.GROUPS, "agents", "mixture", "training", "real_training"}
 CHOOSE_ALL = {"agent", "agents"}  # words that choose all agents
 # `agents.KEY`; the two names that it leaves out are fields that a mixture had in older versions.
 BY_KEY = re.compile(r"agents\.(?!(aggregate|compared_by)$)[^.]+")
@@ -63,7 +63,7 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
             field = shortened(field or "NAME")
             is_choice = any(registry.is_registered(group, field) for group in registry.GROUPS)
             is_name = field.isascii() and field.isidentifier() and not is_choice
-            is_field = name.startswith("-") or field.partition(".")[0] in GROUPS or is_name
+            is_field = name.startswith("-") or field.partition(".")[0] in DOTTED or is_name
             value = f"{field}={shortened((after or text).strip()) or 'VALUE'}"
             fix = f"Write {value if is_field else f'env={field} or proxy={field}'}."
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
