@@ -219,15 +219,21 @@ def _training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingC
 
 
 def train(config: FreshAgentsConfig, world: World, key: str) -> dict[str, Any]:
-    """The results of fresh agents in a world: arrays `[agent]` by column of the table."""
+    """The results of fresh agents in a world: arrays `[agent]` by column of the table.
+
+    Args:
+      config: the settings.
+      world: where they train and are tested.
+      key: of the agent in `config.agents`.
+    """
     env, env_params, task, trainings, is_varied = world
     agent = config.agent_for(key, task, is_varied)
-    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
+    seeds = jax.random.split(jax.random.key(config.seed), config.num_agents)
     counts = {"devices": config.devices, "num_parallel": config.num_parallel}
-    outcome = evaluate_agents(agent, env, env_params, task, trainings[key], keys, **counts)
+    outcome = evaluate_agents(agent, env, env_params, task, trainings[key], seeds, **counts)
     outcome = jax.device_get(outcome)
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # one for each agent
-    varied = jax.device_get(jax.vmap(agent.drawn_values)(keys))
+    varied = jax.device_get(jax.vmap(agent.drawn_values)(seeds))
     return {"test_return": outcome.test_return, **of_agents, **varied}
 
 
