@@ -123,7 +123,7 @@ def test_bad_overrides_are_refused(word, field):
 def test_a_file_of_ranges_must_map_fields_to_ranges(tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.yaml").write_text(text)
-    assert "own.yaml" in str(refusal(search_config.plan_of, ["space=own.yaml"])) or ":" in text
+    assert "own.yaml" in str(refusal(search_config.plan_of, ["space=own.yaml"])) or "my:" in text
 
 
 def test_help_says_what_each_field_is():

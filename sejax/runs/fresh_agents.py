@@ -228,12 +228,13 @@ def train(config: FreshAgentsConfig, world: World, key: str) -> dict[str, Any]:
     """
     env, env_params, task, trainings, is_varied = world
     agent = config.agent_for(key, task, is_varied)
-    seeds = jax.random.split(jax.random.key(config.seed), config.num_agents)
+    random_keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     counts = {"devices": config.devices, "num_parallel": config.num_parallel}
-    outcome = evaluate_agents(agent, env, env_params, task, trainings[key], seeds, **counts)
+    training = trainings[key]
+    outcome = evaluate_agents(agent, env, env_params, task, training, random_keys, **counts)
     outcome = jax.device_get(outcome)
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # one for each agent
-    varied = jax.device_get(jax.vmap(agent.drawn_values)(seeds))
+    varied = jax.device_get(jax.vmap(agent.drawn_values)(random_keys))
     return {"test_return": outcome.test_return, **of_agents, **varied}
 
 

@@ -97,7 +97,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     typed = _tree(texts, groups)
     try:
         text = path.read_text(encoding="utf-8")
-        require_small(text)
+        require_flat_aliases(text)
         values = flatten(yaml.safe_load(text))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         drop_other_choices(file, typed, groups)
@@ -109,7 +109,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
         raise ConfigError("preset", rule, use="best") from error
 
 
-def require_small(text: str) -> None:
+def require_flat_aliases(text: str) -> None:
     """Raises `ValueError` for YAML whose aliases stand for values with aliases.
 
     A few lines of these can make billions of values; other aliases are as long as the file.
