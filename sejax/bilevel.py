@@ -291,5 +291,5 @@ def _require_population(strategy: Strategy, example: Float[Array, " dims"]) -> N
     require(shape == expected, "es", f"must ask for candidates {expected}", got=shape)
     least = min(strategy.num_evals, strategy.num_incumbent_evals)
     require(least > 0, "es", "must have num_evals and num_incumbent_evals of 1 or more", got=least)
-    is_paired = not strategy.antithetic or shape[0] % 2 == 0
-    require(is_paired, "es", "must ask for candidates in pairs, as antithetic ones", got=shape[0])
+    is_paired = not strategy.mirrored or shape[0] % 2 == 0
+    require(is_paired, "es", "must ask for candidates in pairs, as mirrored ones", got=shape[0])

@@ -281,7 +281,7 @@ def make_evaluator(
 
         return run
 
-    run = agent.fresh(make_run)
+    run = agent.with_hparams(make_run)
     if in_batches:
         run = in_batches_on_cpu(run, cpu_num_parallel_of(agent, training))
     return lambda key, env_params, active=True, test_params=None: run(

@@ -57,7 +57,7 @@ class Layout:
         Raises:
           ConfigError: if the population is too small for the mixture.
         """
-        return self.mixture.deal(self.strategy.num_candidates, self.strategy.antithetic)
+        return self.mixture.deal(self.strategy.num_candidates, self.strategy.mirrored)
 
     @property
     def num_on_candidates(self) -> int:

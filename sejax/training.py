@@ -536,7 +536,7 @@ class _Loop:
           recent: as in `is_plateau`, with this episode.
         """
         training = self.training
-        first = self.agent.spec.warmup_episodes
+        first = self.agent.spec.stops_from
         num_episodes = state.episode + 1
         stop = (num_episodes >= training.max_episodes) | state.nonfinite
         may_stop = (state.episode >= first) & (state.train_steps >= training.min_steps)

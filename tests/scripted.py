@@ -93,7 +93,7 @@ def scripted_agent(warmup_episodes=2, batch_size=64):
         hparams=0.0,
         buffer=replay_buffer(batch_size, 1000),
         spec=AgentSpec(
-            warmup_episodes=warmup_episodes, learns_from=warmup_episodes, cpu_num_parallel=None
+            stops_from=warmup_episodes, learns_from=warmup_episodes, cpu_num_parallel=None
         ),
         discount=lambda hparams: 1.0,
     )

@@ -147,7 +147,7 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     assert options.items() <= vars(hparams).items()
     assert {"learning_rate", "discount"} <= set(options)
     assert agent.discount(agent.hparams) == 0.9
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, 0 if case[0] == "ppo" else 3)
+    assert (agent.spec.stops_from, agent.spec.learns_from) == (3, 0 if case[0] == "ppo" else 3)
 
 
 @pytest.mark.parametrize("case", cases([*PLAIN, *EXPLORING]), ids="-".join)

@@ -62,7 +62,7 @@ def stub_agent(kind):
         update=update,
         buffer=replay_buffer(BATCH, 10),
         hparams=(),
-        spec=AgentSpec(warmup_episodes=3, learns_from=2, action_repeat=2),
+        spec=AgentSpec(stops_from=3, learns_from=2, action_repeat=2),
         env_action=jnp.negative,
     )
 

@@ -46,7 +46,7 @@ def mixture(num=2, weights=(), **config):
 def test_candidates_go_to_the_agent_that_is_furthest_behind(weights, num_candidates, candidates):
     agents = mixture(len(weights), weights=weights)
     assert tuple(x.tolist() for x in agents.deal(num_candidates)) == candidates
-    pairs = agents.deal(2 * num_candidates, antithetic=True)
+    pairs = agents.deal(2 * num_candidates, mirrored=True)
     mirrored = tuple(x + [num_candidates + i for i in x] for x in candidates)
     assert tuple(x.tolist() for x in pairs) == mirrored
 
@@ -64,7 +64,7 @@ def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, ev
     (lambda: mixture(2, weights=(1.0, -1.0)), "agents"),
     (lambda: mixture(2, weights=(1.0, NAN)), "agents"),
     (lambda: Mixture(agents=(AGENTS[0], "sarsa")), "agent"),
-    (lambda: mixture(3).deal(4, antithetic=True), "es.population_size"),
+    (lambda: mixture(3).deal(4, mirrored=True), "es.population_size"),
     (lambda: mixture(2, weights=(10.0, 1.0)).deal(4), "es.population_size"),
     (lambda: MixtureConfig(aggregate="max"), "mixture.aggregate"),
 ])  # fmt: skip

@@ -187,12 +187,12 @@ def evosax_strategy(name):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name):
     dims, std, decay = 200, 0.05, 0.5 if name == "open_es" else 1.0
-    size = 32 if ALGORITHMS[name].antithetic else 33
+    size = 32 if ALGORITHMS[name].mirrored else 33
     config = EvosaxConfig(name=name, population_size=size, noise_std=std, noise_std_decay=decay)
     strategy = config.make(dims)
     state = jax.jit(strategy.init)(jax.random.key(0), np.zeros(dims, np.float32))
     members = np.asarray(jax.jit(strategy.ask)(jax.random.key(1), state)[0])
-    assert strategy.antithetic == (np.abs(members[:16] + members[16:32]).max() < 1e-6)
+    assert strategy.mirrored == (np.abs(members[:16] + members[16:32]).max() < 1e-6)
     assert members.std() == pytest.approx(std, rel=0.15)
 
 

@@ -242,7 +242,7 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
         task = dataclasses.replace(env.task, solved_reward=solved_reward)
         return make_evaluator(agent, env, task, config.training)(jax.random.key(0), params)
 
-    assert ended(-1000.0).train_episodes == agent.spec.warmup_episodes + 1
+    assert ended(-1000.0).train_episodes == agent.spec.stops_from + 1
     last, untested = ended(0.0), ended(np.inf)  # which no test would end
     assert last.train_episodes == config.training.max_episodes == 12
     assert untested.train_steps == last.train_steps and untested.real_steps < last.real_steps

@@ -36,7 +36,7 @@ def make_curve_run(
 
         return run
 
-    return agent.fresh(make_run)
+    return agent.with_hparams(make_run)
 
 
 def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.DataFrame:

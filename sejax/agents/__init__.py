@@ -58,7 +58,7 @@ def make_agent(
     Example:
       >>> import sejax
       >>> agent = make_agent(sejax.DDQNConfig(hidden_size=64), sejax.envs.make("cartpole"))
-      >>> agent.spec.warmup_episodes
+      >>> agent.spec.stops_from
       1
     """
     require_part("agent", AgentConfig, config, "Write make_agent(DDQNConfig(), task), for example.")

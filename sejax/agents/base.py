@@ -91,7 +91,7 @@ class AgentSpec:
     """What is known of an agent before it is compiled.
 
     Attributes:
-      warmup_episodes: initial episodes in which no stop rule may end the training.
+      stops_from: first episode, counted from 0, with which a stop rule may end the training.
       learns_from: first episode, counted from 0, in which the agent learns.
       action_repeat: environment steps for each decision.
       cpu_num_parallel: agents in a vmapped batch of a CPU core, unless the user sets
@@ -101,7 +101,7 @@ class AgentSpec:
         unknown.
     """
 
-    warmup_episodes: int = 0
+    stops_from: int = 0
     learns_from: int = 0
     action_repeat: int = 1
     cpu_num_parallel: int | None = 1
@@ -147,8 +147,8 @@ class Agent:
         fix = "Send its configuration to the other process, and call sejax.make_agent there."
         raise TypeError(f"An agent holds functions and cannot be pickled. {fix}")
 
-    def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
-        """Builds `run(key, *args)` for a fresh agent. Varied hyperparameters are drawn first.
+    def with_hparams(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
+        """Builds `run(key, *args)` with the agent's hyperparameters, or with drawn ones.
 
         Args:
           make_run: builds `run(key, *args, hparams)` for one agent.
@@ -170,7 +170,7 @@ class Agent:
         return run
 
     def drawn_values(self, key: Array) -> dict[str, Array]:
-        """The hyperparameters that `fresh` draws for a training with this key, by name."""
+        """The hyperparameters that `with_hparams` draws for a training with this key, by name."""
         return {} if self.varied is None else self.varied.draw(key).values
 
 
@@ -245,7 +245,7 @@ class AgentOptions(AgentConfig):
 
     def spec(self) -> AgentSpec:
         """The spec of an agent that learns once it has warmed up."""
-        return AgentSpec(warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes)
+        return AgentSpec(stops_from=self.warmup_episodes, learns_from=self.warmup_episodes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -95,17 +95,17 @@ class Mixture:
     def size(self) -> int:
         return len(self.agents)
 
-    def deal(self, num_candidates: int, antithetic: bool = False) -> tuple[np.ndarray, ...]:
+    def deal(self, num_candidates: int, mirrored: bool = False) -> tuple[np.ndarray, ...]:
         """The candidates of each agent: their indices in the population, ascending.
 
         Each candidate in turn goes to the agent that is furthest behind its share; an agent of
-        weight 0 gets none. The two candidates of an antithetic pair are compared with each other,
+        weight 0 gets none. The two candidates of a mirrored pair are compared with each other,
         so that they get the same agent.
 
         Raises:
           ConfigError: if an agent with a weight gets no candidate.
         """
-        num_dealt = num_candidates // 2 if antithetic else num_candidates
+        num_dealt = num_candidates // 2 if mirrored else num_candidates
         shares = np.array(self.weights) / sum(self.weights)
         hands: list[list[int]] = [[] for _ in self.agents]
         for candidate in range(num_dealt):
@@ -116,8 +116,8 @@ class Mixture:
         size = 2 * int(1 / shares[shares > 0].min() + self.size + 1)
         rule = f"must be larger: {num_candidates} candidates do not suffice for the agents' shares"
         require(are_enough, "es.population_size", rule, use=size)
-        mirrored = (0, num_dealt) if antithetic else (0,)
-        return tuple(np.add.outer(mirrored, hand).ravel().astype(int) for hand in hands)
+        offsets = (0, num_dealt) if mirrored else (0,)
+        return tuple(np.add.outer(offsets, hand).ravel().astype(int) for hand in hands)
 
     def comparable(
         self,

@@ -28,7 +28,7 @@ class Strategy:
         better, and scores that are not finite rank worst.
       incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
       num_candidates: vectors that `ask` returns; NES with mirrored perturbations asks for 2 n_p.
-      antithetic: whether the second half of the population mirrors the first at the incumbent.
+      mirrored: whether the second half of the population mirrors the first at the incumbent.
       num_evals: evaluations of each candidate, each with a fresh agent.
       eval_aggregate: how the scores of a candidate's evaluations become one score.
       num_incumbent_evals: trainings on the incumbent.
@@ -41,7 +41,7 @@ class Strategy:
     tell: Callable[[Array, Array, Array, Array, StrategyState], StrategyState]
     incumbent: Callable[[StrategyState], Float[Array, " dims"]]
     num_candidates: int
-    antithetic: bool = False
+    mirrored: bool = False
     num_evals: int = 1
     eval_aggregate: Literal["mean", "min"] = "mean"
     num_incumbent_evals: int = 16

@@ -24,21 +24,21 @@ class EvosaxClass(NamedTuple):
 
     Attributes:
       cls: its name.
-      antithetic: whether the second half of its candidates mirrors the first.
+      mirrored: whether the second half of its candidates mirrors the first.
       optimizer: of its mean: "adam", "sgd" (if its steps have a natural scale), or None if it takes
         no optimizer.
     """
 
     cls: str
-    antithetic: bool = False
+    mirrored: bool = False
     optimizer: str | None = None
 
 
 ALGORITHMS = {
     "cma_es": EvosaxClass("CMA_ES"),
-    "cr_fm_nes": EvosaxClass("CR_FM_NES", antithetic=True),
-    "open_es": EvosaxClass("Open_ES", antithetic=True, optimizer="adam"),
-    "pgpe": EvosaxClass("PGPE", antithetic=True, optimizer="adam"),
+    "cr_fm_nes": EvosaxClass("CR_FM_NES", mirrored=True),
+    "open_es": EvosaxClass("Open_ES", mirrored=True, optimizer="adam"),
+    "pgpe": EvosaxClass("PGPE", mirrored=True, optimizer="adam"),
     "sep_cma_es": EvosaxClass("Sep_CMA_ES"),
     "snes": EvosaxClass("SNES", optimizer="sgd"),
     "xnes": EvosaxClass("xNES", optimizer="sgd"),
@@ -69,9 +69,9 @@ class EvosaxConfig(StrategyOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_known("es.name", self.name, ALGORITHMS)
-        _, antithetic, optimizer = ALGORITHMS[self.name]
+        _, mirrored, optimizer = ALGORITHMS[self.name]
         size = self.population_size
-        is_fit = size % 2 == 0 or not antithetic
+        is_fit = size % 2 == 0 or not mirrored
         require(is_fit, "es.population_size", "must be even", got=size, use=size + 1)
         has = {"noise_std_decay": self.name == "open_es", "step_size": optimizer == "adam"}
         for name, has_it in has.items():
@@ -84,7 +84,7 @@ class EvosaxConfig(StrategyOptions):
         """The algorithm over vectors of `num_dims` numbers."""
         from evosax.algorithms import distribution_based_algorithms
 
-        cls, antithetic, optimizer = ALGORITHMS[self.name]
+        cls, mirrored, optimizer = ALGORITHMS[self.name]
         options: dict[str, Any] = {}
         if optimizer == "adam":
             options["optimizer"] = optax.adam(self.step_size)
@@ -102,7 +102,7 @@ class EvosaxConfig(StrategyOptions):
         params = algorithm.default_params
         if self.name != "open_es":
             params = params.replace(std_init=self.noise_std)
-        fields = {"antithetic": antithetic, "num_incumbent_evals": self.num_incumbent_evals}
+        fields = {"mirrored": mirrored, "num_incumbent_evals": self.num_incumbent_evals}
         strategy = from_evosax(algorithm, params, **fields, **self.shared())
         if self.name not in ("open_es", "xnes"):
             return strategy
@@ -126,7 +126,7 @@ def from_evosax(
     Args:
       algorithm: a distribution-based algorithm for vectors `[num_dims]`.
       params: of the algorithm; its `default_params` if not given.
-      **fields: further fields of `Strategy`: `antithetic`, and how often candidates are evaluated.
+      **fields: further fields of `Strategy`: `mirrored`, and how often candidates are evaluated.
 
     Example:
       >>> from evosax.algorithms import Rm_ES

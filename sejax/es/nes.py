@@ -115,7 +115,7 @@ class NESConfig(StrategyOptions):
             tell=tell,
             incumbent=lambda state: state.mean,
             num_candidates=2 * num_noises if self.mirrored else num_noises,
-            antithetic=self.mirrored,
+            mirrored=self.mirrored,
             num_incumbent_evals=self.num_incumbent_evals or num_noises,
             **self.shared(),
         )

@@ -235,17 +235,18 @@ class RewardEnv(ProxyEnv):
             env_state=env_state, obs=obs, augmentation=augmentation, time=state.time + 1
         )
         if self.config.shaping.weighs_info:
-            bonus = params.weights["info_weights"] @ _select(info, self.task.info_keys)
+            learned = params.weights["info_weights"] @ _select(info, self.task.info_keys)
         else:
-            bonus = self.potential(params, obs, augmentation)
+            learned = self.potential(params, obs, augmentation)
             if self.config.zero_at_terminal:
                 is_cut = self.is_truncated(next_state, params)
-                bonus = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, bonus)
+                is_end = terminated | (params.limit_is_terminal & is_cut)
+                learned = jnp.where(is_end, 0.0, learned)
         if self.config.shaping.is_potential_based:
             before = self.potential(params, state.obs, state.augmentation)
-            bonus = params.discount * bonus - before
-        reward = real_reward + bonus if self.config.shaping.is_additive else bonus
-        is_sane = jnp.isfinite(reward) & (jnp.abs(bonus) < MAX_ABS_VALUE)
+            learned = params.discount * learned - before
+        reward = real_reward + learned if self.config.shaping.is_additive else learned
+        is_sane = jnp.isfinite(reward) & (jnp.abs(learned) < MAX_ABS_VALUE)
         discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
