@@ -133,43 +133,39 @@ class RemoteChunks(Chunks):
         self.compiled[length] = functools.partial(self._generations, *self._program, length)
 
     @functools.cached_property
-    def _program(self) -> tuple[jax.stages.Compiled, list[Outcome]]:
-        """The program of `ask` and `tell`, and the outcomes that it is given to ask.
+    def _program(self) -> tuple[jax.stages.Compiled, Outcome]:
+        """The program of `ask` and `tell`, and the outcome that it is given to ask.
 
         One program does both, and runs twice in a generation. In a program of `ask` alone, XLA
         would round the candidates otherwise than in `Bilevel.generation`.
         """
         bilevel = self.bilevel
 
-        def generation(state: LearnState, by_agent: list[Outcome]) -> tuple[Any, ...]:
+        def generation(state: LearnState, outcome: Outcome) -> tuple[Any, ...]:
             candidates = bilevel.ask(state)
             trainings = bilevel.evaluate.trainings(candidates)
             sent = [dataclasses.replace(x, key=jax.random.key_data(x.key)) for x in trainings]
-            return bilevel.tell(state, candidates, bilevel.evaluate.joined(by_agent)), sent
-
-        def evaluate(state: LearnState) -> list[Outcome]:
-            trainings = bilevel.evaluate.trainings(bilevel.ask(state))
-            pairs = zip(bilevel.evaluate.evaluators, trainings, strict=True)
-            return [jax.vmap(run)(of_agent) for run, of_agent in pairs]
+            return bilevel.tell(state, candidates, outcome), sent
 
         state = jax.eval_shape(bilevel.init, jax.random.key(0))
-        no_outcomes = jax.tree.map(jnp.zeros_like, jax.eval_shape(evaluate, state))
+        outcome = jax.eval_shape(lambda state: bilevel.evaluate(bilevel.ask(state)), state)
+        no_outcome = jax.tree.map(jnp.zeros_like, outcome)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        return jitted.lower(state, no_outcomes).compile(), no_outcomes
+        return jitted.lower(state, no_outcome).compile(), no_outcome
 
     def _generations(
-        self, generation: Any, no_outcomes: list[Outcome], length: int, state: LearnState
+        self, generation: Any, no_outcome: Outcome, length: int, state: LearnState
     ) -> tuple[LearnState, GenerationInfo]:
         """Runs `length` generations with the compiled program."""
         infos = []
         for _ in range(length):
-            _, trainings = generation(state, no_outcomes)
+            _, trainings = generation(state, no_outcome)
             (state, info), _ = generation(state, self._evaluate(jax.device_get(trainings)))
             infos.append(info)
         return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *infos)
 
-    def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
-        """The outcomes of each agent's trainings, leaves `[training, ...]`."""
+    def _evaluate(self, by_agent: Sequence[Trainings]) -> Outcome:
+        """The outcomes of all agents' trainings, leaves `[training, ...]`."""
         shares: list[WorkShare] = []
         for agent_index, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
             for start in range(0, len(trainings.active), size):
@@ -179,7 +175,8 @@ class RemoteChunks(Chunks):
         for (agent_index, _), (outcome, cpu_s) in zip(shares, self._compute(shares), strict=True):
             parts[agent_index].append(outcome)
             self.cpu_s += cpu_s
-        return [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
+        outcomes = [jax.tree.map(lambda *leaves: np.concatenate(leaves), *part) for part in parts]
+        return self.bilevel.evaluate.joined(outcomes)
 
 
 # --- the cluster ----------------------------------------------------------------------------------
