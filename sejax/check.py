@@ -187,7 +187,7 @@ def _rows_on_proxy(config: CheckConfig, proxy: Proxy) -> dict[str, Row]:
     rows = {}
     for name, of_row in students.items():
         row_config = dataclasses.replace(config, agents=of_row)
-        trainings = fresh_agents.trainings_on(proxy, row_config)
+        trainings = {key: fresh_agents.training_on(proxy, row_config, key) for key in of_row}
         rows[name] = Row(row_config, World(proxy.env, proxy.params, proxy.task, trainings))
     return rows
 

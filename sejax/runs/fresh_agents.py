@@ -163,7 +163,8 @@ def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
         return {"the real task": on_task}
     if config.agent_hparams == "as_learned":
         on_task = on_task._replace(is_varied=proxy.config.get("agent_hparams") == "varied")
-    on_proxy = World(proxy.env, proxy.params, task, trainings_on(proxy, config), on_task.is_varied)
+    trainings = {key: training_on(proxy, config, key) for key in config.agents}
+    on_proxy = World(proxy.env, proxy.params, task, trainings, on_task.is_varied)
     return {"the proxy": on_proxy, "the real task": on_task}
 
 
@@ -195,16 +196,12 @@ def loaded(config: FreshAgentsConfig) -> Proxy:
     return proxy
 
 
-def trainings_on(proxy: Proxy, config: FreshAgentsConfig) -> dict[str, TrainingConfig]:
-    """How long each agent trains on a proxy, by key; see `FreshAgentsConfig.training_from`.
+def training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingConfig:
+    """How long the agent of a key trains on a proxy; see `FreshAgentsConfig.training_from`.
 
     Raises:
-      ConfigError: if the proxy's file does not say it, or an agent would learn nothing.
+      ConfigError: if the proxy's file does not say it, or the agent would learn nothing.
     """
-    return {key: _training_on(proxy, config, key) for key in config.agents}
-
-
-def _training_on(proxy: Proxy, config: FreshAgentsConfig, key: str) -> TrainingConfig:
     group, training = "training", config.training
     if config.training_from == "proxy" and proxy.env.has_real_dynamics:
         group, training = "real_training", config.real_training
