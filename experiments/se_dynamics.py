@@ -30,7 +30,7 @@ from experiments.common.shards import stack, unstack
 from sejax import Task, envs
 from sejax.ops.scores import reaches
 from sejax.options import Count
-from sejax.runs.chunks import make_chunks
+from sejax.runs.chunks import Chunks
 
 # On Pendulum, preset=best has a reward whose best action is known.
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", "proxy.reward_form=network")
@@ -109,7 +109,7 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
     configs = {kind: settings.config_of(kind) for kind in settings.kinds}
     curves, tests = [], [se_myopia.untrained(settings, task, tuned)]
     for kind, config in configs.items():
-        chunks = make_chunks(config)
+        chunks = Chunks(config)
         folder = settings.work_folder / "runs" / kind
         for run in runs.configs_of(config, settings.runs, folder):
             own = {"kind": kind, "seed": run.seed}

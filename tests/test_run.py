@@ -22,7 +22,7 @@ from support import metrics as rows
 import sejax
 from sejax import run
 from sejax.runs import commands, run_directory, runtime, session
-from sejax.runs.chunks import Chunks, make_chunks
+from sejax.runs.chunks import Chunks
 from sejax.runs.config import LearnConfig
 from sejax.runs.progress import RunProgress
 from sejax.runs.run_directory import AGENT_COLUMNS, COLUMNS
@@ -38,7 +38,7 @@ START = functools.partial(commands.start, run.main, run.help_text, LearnConfig.o
 @functools.cache
 def chunks(*words):
     """The compiled program of a configuration, which all runs of it share."""
-    return make_chunks(sejax.config(words))
+    return Chunks(sejax.config(words))
 
 
 def learn(path, *words, program=(), base=TINY):

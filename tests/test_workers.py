@@ -26,7 +26,7 @@ def require_equal_numbers(words, generations):
         return [ray.outcomes_of(setup, share) for share in reversed(shares)][::-1]
 
     remote = RemoteChunks(config, compute)
-    local = Chunks(remote.bilevel)
+    local = Chunks(config, devices=1)
     local.compile(1)
     remote.compile(1)
     state, other = local.init(jax.random.key(0)), remote.init(jax.random.key(0))

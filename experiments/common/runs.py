@@ -23,7 +23,7 @@ from sejax.ops.files import write_text
 from sejax.ops.scores import reaches
 from sejax.options import ConfigError, Count, require
 from sejax.runs import run_directory, session
-from sejax.runs.chunks import Chunks, make_chunks
+from sejax.runs.chunks import Chunks
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
 QUICK = (
@@ -87,7 +87,7 @@ def learn(configs: list[Any], option: str = "work", chunks: Chunks | None = None
     Raises:
       ConfigError: if a folder holds a run of other settings or of more generations, or is in use.
     """
-    chunks = chunks or make_chunks(configs[0])
+    chunks = chunks or Chunks(configs[0])
     curves = []
     for config in configs:
         with run_directory.RunDirectory(config, option) as directory:

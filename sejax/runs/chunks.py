@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import jax
 
-from sejax.bilevel import Bilevel, LearnState, make_bilevel
+from sejax.bilevel import LearnState, make_bilevel
 from sejax.ops.parallel import compiler_options
 from sejax.runs.config import LearnConfig, MachinesConfig
 from sejax.scoring import GenerationInfo
@@ -23,6 +23,10 @@ class Chunks:
     `jax.jit` would compile again for a new state, a restored one, and one that a chunk returned,
     because their placements differ.
 
+    Args:
+      config: of the runs, which may differ in the seed.
+      **parts: arguments of `make_bilevel` in place of the configuration's.
+
     Attributes:
       bilevel: the functions of Algorithm 1.
       cpu_s: CPU seconds of other processes.
@@ -31,9 +35,9 @@ class Chunks:
 
     cpu_s = 0.0
 
-    def __init__(self, bilevel: Bilevel):
-        self.bilevel = bilevel
-        self.init: Callable[[jax.Array], LearnState] = jax.jit(bilevel.init)  # before generation 0
+    def __init__(self, config: LearnConfig, **parts: Any):
+        self.bilevel = make_bilevel(**config.parts() | parts)
+        self.init: Callable[[jax.Array], LearnState] = jax.jit(self.bilevel.init)
         self.compiled: dict[int, Chunk] = {}
 
     def compile(self, length: int) -> None:
@@ -55,14 +59,9 @@ class Chunks:
         return self.compiled[length](state)
 
 
-def make_chunks(config: LearnConfig) -> Chunks:
-    """The generations of a configuration; runs that differ in the seed may share them."""
-    return Chunks(make_bilevel(**config.parts()))
-
-
 @dataclass(frozen=True, kw_only=True)
 class LocalConfig(MachinesConfig):
     """This process computes everything: one compiled program over its devices."""
 
     def make(self, config: LearnConfig) -> contextlib.AbstractContextManager[Chunks]:
-        return contextlib.nullcontext(make_chunks(config))
+        return contextlib.nullcontext(Chunks(config))

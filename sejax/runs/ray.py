@@ -124,7 +124,7 @@ class RemoteChunks(Chunks):
     """
 
     def __init__(self, config: LearnConfig, compute: Compute):
-        super().__init__(make_bilevel(**config.parts() | {"devices": 1}))
+        super().__init__(config, devices=1)
         self._compute = compute
         self._sizes = share_sizes(self.bilevel, config.num_parallel)
 

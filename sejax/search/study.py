@@ -25,7 +25,7 @@ from sejax.ops.files import require_writable, write_text
 from sejax.options import ConfigError, FailedError, place_of, told
 from sejax.options.plain import parsed
 from sejax.runs import session
-from sejax.runs.chunks import make_chunks
+from sejax.runs.chunks import Chunks
 from sejax.runs.config import LearnConfig
 from sejax.runs.run_directory import RunDirectory
 from sejax.runs.runtime import platform_error
@@ -113,7 +113,7 @@ def make_run(config: LearnConfig, folder: Path, seeds: Sequence[int]) -> Callabl
     Returns:
       A function that continues the runs up to a number of generations.
     """
-    chunks = make_chunks(config)
+    chunks = Chunks(config)
 
     def run(generations: int) -> Progress:
         means, summaries = [], []
