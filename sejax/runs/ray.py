@@ -130,7 +130,17 @@ class RemoteChunks(Chunks):
 
     def compile(self, length: int) -> None:
         """Compiles `ask` and `tell`, which serve chunks of any length."""
-        self.compiled[length] = functools.partial(self._generations, *self._program, length)
+        generation, no_outcome = self._program
+
+        def chunk(state: LearnState) -> tuple[LearnState, GenerationInfo]:
+            infos = []
+            for _ in range(length):
+                _, trainings = generation(state, no_outcome)
+                (state, info), _ = generation(state, self._evaluate(jax.device_get(trainings)))
+                infos.append(info)
+            return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *infos)
+
+        self.compiled[length] = chunk
 
     @functools.cached_property
     def _program(self) -> tuple[jax.stages.Compiled, Outcome]:
@@ -153,19 +163,8 @@ class RemoteChunks(Chunks):
         jitted = jax.jit(generation, compiler_options=compiler_options())
         return jitted.lower(state, no_outcome).compile(), no_outcome
 
-    def _generations(
-        self, generation: Any, no_outcome: Outcome, length: int, state: LearnState
-    ) -> tuple[LearnState, GenerationInfo]:
-        """Runs `length` generations with the compiled program."""
-        infos = []
-        for _ in range(length):
-            _, trainings = generation(state, no_outcome)
-            (state, info), _ = generation(state, self._evaluate(jax.device_get(trainings)))
-            infos.append(info)
-        return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *infos)
-
-    def _evaluate(self, by_agent: Sequence[Trainings]) -> Outcome:
-        """The outcomes of all agents' trainings, leaves `[training, ...]`."""
+    def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
+        """The outcomes of each agent's trainings, leaves `[training, ...]`."""
         shares: list[WorkShare] = []
         for agent_index, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
             for start in range(0, len(trainings.active), size):
