@@ -77,33 +77,24 @@ class Objective:
     def search_scores(self, outcome: Outcome) -> Float[Array, "*training"]:
         """The scores that compare candidates; nan for diverged agents.
 
+        A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
+
         Raises:
           ConfigError: unless there is a score for each agent.
         """
-        return _checked(self.score(outcome), outcome.nonfinite)
+        scores = jnp.asarray(self.score(outcome))
+        shape = outcome.nonfinite.shape
+        rule = f"must give one score for each agent, {shape}"
+        require(scores.shape == shape, "objective", rule, got=scores.shape)
+        return jnp.where(outcome.nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
 
     def shown_scores(self, outcome: Outcome) -> Float[Array, "*training"]:
-        """The scores that people see; nan for diverged agents.
+        """The scores that people see: those of `shown`, as `search_scores` gives those of `score`.
 
         Raises:
-          ConfigError: unless there is a score for each agent.
+          ConfigError: as `search_scores`.
         """
-        return _checked((self.shown or self.score)(outcome), outcome.nonfinite)
-
-
-def _checked(scores: Array, nonfinite: Bool[Array, "*training"]) -> Float[Array, "*training"]:
-    """The scores, with nan for diverged agents.
-
-    A score beyond `MOST` counts as diverged: the statistics of such scores would overflow.
-
-    Raises:
-      ConfigError: unless there is a score for each agent.
-    """
-    scores = jnp.asarray(scores)
-    shape = nonfinite.shape
-    rule = f"must give one score for each agent, {shape}"
-    require(scores.shape == shape, "objective", rule, got=scores.shape)
-    return jnp.where(nonfinite | ~(jnp.abs(scores) <= MOST), jnp.nan, scores)
+        return replace(self, score=self.shown or self.score).search_scores(outcome)
 
 
 @dataclass(frozen=True, kw_only=True)
