@@ -54,7 +54,7 @@ class EvaluateConfig(FreshAgentsConfig):
     @property
     def folder(self) -> Path:
         """`out_dir`; by default that of the proxy, if it has one."""
-        if self.out_dir or self.proxy == "real" or hub.is_address(self.proxy):
+        if self.out_dir or self.proxy == "real" or self.proxy.startswith(hub.SCHEME):
             return super().folder
         beside = header.find(self.proxy, "proxy").parent
         return super().folder if beside == header.PRETRAINED_DIR else beside

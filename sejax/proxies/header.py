@@ -158,7 +158,7 @@ def find(source: str | Path, option: str = "source") -> Path:
       ConfigError: if there is none, or it cannot be fetched.
     """
     name = str(source)
-    if hub.is_address(name):
+    if name.startswith(hub.SCHEME):
         return hub.fetch(name, option)
     path = with_home(name)
     file = os.path.join(path, hub.FILE) if os.path.isdir(path) else path

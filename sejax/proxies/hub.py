@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sejax.options import ConfigError, require, require_package, shortened, told
 
-SCHEME = "hf://"
+SCHEME = "hf://"  # addresses on the Hub begin so
 FILE = "proxy.safetensors"
 MAX_BYTES = 100_000_000  # of a file: a hundred times the largest set of proxies so far
 
@@ -23,11 +23,6 @@ _ADDRESS = re.compile(
     r"(?:/((?:\w[\w.-]*/){0,8}\w[\w.-]*\.safetensors))?",
     re.ASCII,
 )
-
-
-def is_address(source: str) -> bool:
-    """Whether a source is an address on the Hub."""
-    return source.startswith(SCHEME)
 
 
 def parse(address: str, option: str = "source") -> tuple[str, str | None, str]:

@@ -183,13 +183,13 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
         plain["learning"].pop("command")  # the card shows it below
     facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
-        "front": json.dumps(license) if hub.is_address(source) else None,
+        "front": json.dumps(license) if source.startswith(hub.SCHEME) else None,
         "tags": json.dumps(["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]),
         **{name: "" if name == kind else None for name in _KINDS},
         "facts": yaml.safe_dump(facts, sort_keys=False).rstrip(),
         "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
         "command": proxy.learning and proxy.learning.command,
-        "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
+        "install": "With `pip install 'sejax[hub]'`:\n\n" if source.startswith(hub.SCHEME) else "",
         "gym": gym if kind == "se" else "",
         "call": call,
         "source": source,
