@@ -22,10 +22,9 @@ from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
-# A caller must give the parts that no file can name: by group, the arguments of `sejax.load`, and
-# the words of a command.
-PLUGIN_ARGUMENTS = {"env": "task", "proxy": "proxy"}
-PLUGIN_WORDS = {"env": "env", "proxy": "proxy_kind"}
+# A caller must give the parts that no file can name: by group, the argument of `sejax.load` and the
+# word of a command.
+GIVEN = {"env": ("task", "env"), "proxy": ("proxy", "proxy_kind")}
 BY_HAND = ", made by hand"  # ends the name of a task that no name makes again
 KIND = "sejax"  # name of the metadata's entry
 
@@ -130,8 +129,7 @@ def configured(group: str, values: object, where: str) -> Any:
         require_typed({group: values})
         return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"
-    argument = PLUGIN_ARGUMENTS.get(group, group)
-    word = PLUGIN_WORDS.get(group, group)
+    argument, word = GIVEN.get(group, (group, group))
     rule = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"
     is_path = ":" in str(name) and not str(name).startswith("__main__:")  # a script's own
     text = shortened(name, 80) if is_path else "MODULE:NAME"

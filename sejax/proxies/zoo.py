@@ -144,7 +144,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
         "task": learned.task,
         "settings": config["proxy"],
         "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
-        "needs": [x for x in ("env", "proxy") if not header.is_registered(x, config[x])],
+        "needs": [x for x in header.GIVEN if not header.is_registered(x, config[x])],
     }
     return from_plain(PretrainedProxy, values, "record")
 
@@ -169,9 +169,9 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
       license: name of the license; by default that of the shipped proxies.
     """
     kind = proxy.kind if proxy.kind in _KINDS else "other"
-    plugins = [f"{header.PLUGIN_ARGUMENTS[group]}=..." for group in proxy.needs]
-    call = ", ".join([f'"{source}"', *plugins])
-    words = "".join(f" {header.PLUGIN_WORDS[group]}=..." for group in proxy.needs)
+    given = [header.GIVEN[group] for group in proxy.needs]
+    call = ", ".join([f'"{source}"', *(f"{argument}=..." for argument, _ in given)])
+    words = "".join(f" {word}=..." for _, word in given)
     gym = f"env = sejax.gym.make({call})  # a gymnasium.Env, in NumPy: any agent\n"
     best = max(proxy.on_proxy, key=lambda evaluation: evaluation.return_mean, default=None)
     if best and best.hparams != "as_learned":
