@@ -185,6 +185,8 @@ def unknown_field(field: str, known: Collection[str]) -> ConfigError:
 def _read(value: Any, hint: Any, name: str, default: Any, group: str | None) -> Any:
     """A value as its field's type: values by key, sorted; a plugin; a dataclass; or a leaf.
 
+    A leaf is a number, a text or a list. As an override's text it is read, or else stays as it is.
+
     Args:
       value: plain values.
       hint: the type.
@@ -206,11 +208,6 @@ def _read(value: Any, hint: Any, name: str, default: Any, group: str | None) -> 
         require(isinstance(value, Mapping), name, rule, got=repr(value), fix="Leave it out.")
         base = to_plain(default) if isinstance(default, hint) else {}
         return from_plain(hint, base | value, name)
-    return _leaf(value, hint, name, default)
-
-
-def _leaf(value: Any, hint: Any, name: str, default: Any) -> Any:
-    """A number, a text or a list, which may stand as an override's text: read, or else as it is."""
     reading = value
     if isinstance(value, str):
         value = with_home(value)
