@@ -65,13 +65,9 @@ def to_plain(value: object, group: str | None = None) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def plugin(group: str, by_key: bool = False) -> Any:
-    """A dataclass field with a plugin's configuration, or with those of several by keys.
-
-    The default is sejax's own first plugin; by keys there is none.
-    """
-    first = {"name": registry.names(group)[0]}
-    factory: Any = dict if by_key else functools.partial(configure, group, first)
+def plugin(group: str) -> Any:
+    """A dataclass field with a plugin's configuration; the default is sejax's own first plugin."""
+    factory = functools.partial(configure, group, {"name": registry.names(group)[0]})
     return dataclasses.field(default_factory=factory, metadata={"plugin": group})
 
 

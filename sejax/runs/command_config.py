@@ -21,7 +21,7 @@ import dataclasses
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -69,7 +69,7 @@ class CommandConfig(Options, ABC):
     free: ClassVar[Collection[str]] = ()
     help_words: ClassVar[Sequence[str]] = ()
 
-    agents: dict[str, AgentConfig] = plugin("agent", by_key=True)
+    agents: dict[str, AgentConfig] = field(default_factory=dict, metadata={"plugin": "agent"})
     exploration: ExplorationConfig = plugin("exploration")
     training: TrainingConfig = TrainingConfig()
     seed: WholeNumber = 0
