@@ -95,13 +95,16 @@ class FreshAgentsConfig(CommandConfig):
             require(are_same, "agents", "must be the proxy's", got=", ".join(names), fix=fix)
         if learned and (asked == "as_learned" or (asked is None and not names)):
             return {"proxy": learned | {"agent_hparams": "as_learned"}}
-        # Agents of these names take the hyperparameters of the proxy's.
+        # Agents take the hyperparameters of the proxy's of their name; of several, of their key's.
         known = learned["agents"] if learned and asked is None else {}
         if not names:
             task = {"env": {"name": typed.get("env", "cartpole")}}
             name = agents.default_for(stored.spec) if stored else default_agent(task)
             names = {name: name}
-        of_agents = {key: agent_like(known, key, name) for key, name in names.items()}
+        of_agents: Tree = {}
+        for key, name in names.items():
+            same = {k: agent for k, agent in known.items() if agent["name"] == name}
+            of_agents[key] = same.get(key) or next(iter(same.values()), {"name": name})
         return {"proxy": {"agents": of_agents}}
 
 
@@ -136,12 +139,6 @@ def learned_layer(config: Mapping[str, Any]) -> Tree:
     limit = flatten(config).get("training.time_limit_is_terminal", True)
     real_training = {"time_limit_is_terminal": limit}
     return {"agents": config["agents"], "exploration": explored, "real_training": real_training}
-
-
-def agent_like(known: Mapping[str, Tree], key: str, name: str) -> Tree:
-    """An agent with the hyperparameters of the known one of its name; of several, of its key."""
-    same = {k: agent for k, agent in known.items() if agent["name"] == name}
-    return same.get(key) or next(iter(same.values()), {"name": name})
 
 
 def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
