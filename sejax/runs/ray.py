@@ -163,8 +163,8 @@ class RemoteChunks(Chunks):
         jitted = jax.jit(generation, compiler_options=compiler_options())
         return jitted.lower(state, no_outcome).compile(), no_outcome
 
-    def _evaluate(self, by_agent: Sequence[Trainings]) -> list[Outcome]:
-        """The outcomes of each agent's trainings, leaves `[training, ...]`."""
+    def _evaluate(self, by_agent: Sequence[Trainings]) -> Outcome:
+        """The outcomes of all trainings, leaves `[training, ...]`."""
         shares: list[WorkShare] = []
         for agent_index, (trainings, size) in enumerate(zip(by_agent, self._sizes, strict=True)):
             for start in range(0, len(trainings.active), size):
