@@ -94,7 +94,7 @@ def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
 
 
 def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Agent:
-    """An agent whose options are drawn anew for each training; see `Agent.fresh`.
+    """An agent whose options are drawn anew for each training; see `Agent.with_hparams`.
 
     Args:
       config: configuration around which options are drawn.
