@@ -78,11 +78,15 @@ class FreshAgentsConfig(CommandConfig):
         default one trains.
 
         Raises:
-          ConfigError: without a proxy; with `agent_hparams=as_learned`, if words name others, or if
-            the file has none.
+          ConfigError: without a proxy; for a `training` that is not read; with
+            `agent_hparams=as_learned`, if words name others, or if the file has none.
         """
         require("proxy" in typed, "proxy", "must be given", use="RUN_DIR, FILE or cartpole")
-        require_read(typed)
+        # Defaults may stand there: `--print-config` writes them, and its file may come as a preset.
+        printed = {"training": to_plain(TrainingConfig())}
+        is_default = merge(printed, typed)["training"] == printed["training"]
+        is_read = is_default or typed.get("training_from") == "config"
+        require(is_read, "training", "must come with training_from=config, or be real_training.*.")
         stored = stored_header(str(typed["proxy"]))
         learned = learned_layer(stored.config) if stored else {}
         drop_other_choices(learned, typed, ["exploration"])
@@ -106,17 +110,6 @@ class FreshAgentsConfig(CommandConfig):
             same = {k: agent for k, agent in known.items() if agent["name"] == name}
             of_agents[key] = same.get(key) or next(iter(same.values()), {"name": name})
         return {"proxy": {"agents": of_agents}}
-
-
-def require_read(typed: Tree) -> None:
-    """Checks that fields of `training`, if any are typed, are read.
-
-    Defaults may stand there: `--print-config` writes them, and its file may come as a preset.
-    """
-    printed = {"training": to_plain(TrainingConfig())}
-    is_default = merge(printed, typed)["training"] == printed["training"]
-    is_read = is_default or typed.get("training_from") == "config"
-    require(is_read, "training", "must come with training_from=config, or be real_training.*.")
 
 
 def stored_header(proxy: str) -> header.Header | None:
