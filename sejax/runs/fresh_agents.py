@@ -238,19 +238,16 @@ def summarise(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
 
 
-def spread(mean: float, std: float, digits: int) -> str:
-    """Mean and deviation as text; one agent has no deviation."""
-    return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
-
-
 def print_table(
     summary: pd.DataFrame, title: str, last: str, shown: Mapping[str, tuple[str, int]] = SHOWN
 ) -> None:
     """Prints what `summarise` returns, a row for each group, and a last line below."""
-    columns = {}
+    columns: dict[str, list[str]] = {}
     for label, (name, digits) in shown.items():
-        pairs = zip(summary[f"{name}_mean"], summary[f"{name}_std"], strict=True)
-        columns[label] = [spread(mean, std, digits) for mean, std in pairs]
+        columns[label] = []
+        for mean, std in zip(summary[f"{name}_mean"], summary[f"{name}_std"], strict=True):
+            deviation = f" ± {std:,.{digits}f}" if math.isfinite(std) else ""  # one agent has none
+            columns[label].append(f"{mean:,.{digits}f}{deviation}")
     table = pd.DataFrame(columns, summary.index).rename_axis([None] * summary.index.nlevels)
     print(f"{title}\n\n{table.rename_axis(columns='trained on').to_string(sparsify=False)}\n")
     if diverged := int(summary["num_nonfinite"].sum()):
