@@ -16,10 +16,6 @@ from safetensors.numpy import load, save
 _BLANK = "0" * 64
 
 
-class DamagedError(ValueError):
-    """The bytes are not those of a checksummed file; the message is a clause that says why."""
-
-
 def pack(tensors: dict[str, np.ndarray], kind: str, manifest: dict[str, Any]) -> bytes:
     """The content of a checksummed file.
 
@@ -48,7 +44,7 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any
     """Inverse of `pack`: tensors and manifest, after the checksum was verified.
 
     Raises:
-      DamagedError: if a byte has changed, or it is another kind of file.
+      ValueError: if a byte has changed, or it is another kind of file; the message says why.
     """
     try:
         end = 8 + int.from_bytes(data[:8], "little")
@@ -58,9 +54,9 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any
         tensors = load(data)
         is_whole = hashlib.sha256(blank).hexdigest().encode() == digest
     except Exception as error:  # the bytes may be anything
-        raise DamagedError("it cannot be read") from error
+        raise ValueError("it cannot be read") from error
     if not is_whole:
-        raise DamagedError("its content does not match its digest")
+        raise ValueError("its content does not match its digest")
     return tensors, manifest
 
 
@@ -68,12 +64,12 @@ def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """As `unpack`, of a file.
 
     Raises:
-      DamagedError: as `unpack`. A file whose size does not fit its header is not read.
+      ValueError: as `unpack`. A file whose size does not fit its header is not read.
       OSError: if it cannot be read.
     """
     try:
         with path.open("rb"), safe_open(path, "np"):  # safe_open raises no OSError for a folder
             pass
     except SafetensorError as error:
-        raise DamagedError("it has no header that fits its size") from error
+        raise ValueError("it has no header that fits its size") from error
     return unpack(path.read_bytes(), kind)
