@@ -48,7 +48,7 @@ class AgentInfo(struct.PyTreeNode):
 class GenerationInfo(struct.PyTreeNode):
     """Statistics of a generation: numbers of a row of `metrics.csv`, and what they are made of.
 
-    A row begins with `generation` and the run's `seed`, then has the numbers up to `num_nonfinite`,
+    A row begins with `generation` and the run's `seed`, then has the fields before `by_agent`,
     `env_steps_total` (real steps so far) and `wall_s`; `pandas.read_csv` reads the file.
 
     Scores are those that people see (`Objective.shown_scores`). Those of the population leave out

@@ -22,12 +22,10 @@ from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 from sejax.scoring import AgentInfo, GenerationInfo
 
+_FIELDS = tuple(GenerationInfo.__dataclass_fields__)
+_NUMBERS = _FIELDS[1 : _FIELDS.index("by_agent")]  # all after `generation`
 # `env_steps_total` counts steps on the real task, none in an SE.
-COLUMNS = (
-    *("generation", "seed", "incumbent_mean", "incumbent_std", "population_mean", "population_max"),
-    *("best_so_far", "train_steps_mean", "train_steps_max", "train_episodes_mean"),
-    *("num_nonfinite", "env_steps_total", "wall_s"),
-)
+COLUMNS = ("generation", "seed", *_NUMBERS, "env_steps_total", "wall_s")
 # Columns that a mixture also has for each agent, with the agent's name at the end.
 AGENT_COLUMNS = tuple(AgentInfo.__dataclass_fields__)
 
