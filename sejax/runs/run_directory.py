@@ -110,14 +110,21 @@ class RunDirectory(Store):
           ConfigError: if the checkpoint's state has another structure.
           OSError: if a file cannot be written.
         """
-        if self._tensors is None:
+        tensors = self._tensors
+        if tensors is None:
             return None
         asked = jax.eval_shape(_named, like)
-        if differing := differences(_shapes(self._tensors), _shapes(asked)):
+        if differing := differences(_shapes(tensors), _shapes(asked)):
             got = f"{self.folder}, whose state differs in {differing}"
             raise self.refused(f"must be of this version; got {got}")
         self._remake()
-        return _as_tree(self._tensors, like)
+
+        def stored(path: jax.tree_util.KeyPath, leaf: jax.Array) -> jax.Array:
+            """The inverse of `_named` for a leaf: with its own memory, tied to no device."""
+            array = jax.numpy.array(tensors[_STATE + jax.tree_util.keystr(path)])
+            return jax.random.wrap_key_data(array) if _is_key(leaf) else array
+
+        return jax.tree.map_with_path(stored, like)
 
     def save(
         self, state: PyTree[jax.Array], info: GenerationInfo, wall_s: float, cpu_s: float
@@ -208,21 +215,6 @@ def _as_text(value: np.generic) -> str:
 
 
 # --- pytrees as tensors by name -------------------------------------------------------------------
-
-
-def _as_tree(tensors: dict[str, np.ndarray], like: State) -> State:
-    """A pytree of stored leaves; each has its own memory and is tied to no device.
-
-    Args:
-      tensors: leaves by path.
-      like: a pytree of the same structure; its shapes are enough.
-    """
-
-    def restored(path: jax.tree_util.KeyPath, leaf: jax.Array) -> jax.Array:
-        array = jax.numpy.array(tensors[_STATE + jax.tree_util.keystr(path)])
-        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
-
-    return jax.tree.map_with_path(restored, like)
 
 
 def _named(tree: PyTree) -> dict[str, jax.Array]:
