@@ -238,7 +238,7 @@ def _others(config: CheckConfig, task: Task) -> Agents:
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in known}
     for key, agent in (learned | others).items():
-        field = config.field_of(key) if key in learned else "algorithms"
+        field = config.group_of(key) if key in learned else "algorithms"
         agents.require_fit(agent, config.exploration, task, task.name, field)
     return others
 

@@ -380,17 +380,15 @@ class _Loop:
     def rollout(
         self, buffer: Buffer, large: PyTree, state: _LoopState, consts: _Consts, masked: bool
     ) -> tuple[PyTree, _LoopState]:
-        """Fills the buffer and learns from it. If the training ends before, it learns nothing.
+        """An iteration of the loop that replaces `learns_every` of `step`, with its arguments.
 
-        With `learns_every=3` an iteration is step, step, step, learn. Each `step` is masked, since
-        the training may end at the first or second one.
-
-        An iteration of the loop, with the arguments of `step`: it replaces `learns_every` of them.
+        Fills the buffer and learns from it. If the training ends before, it learns nothing. With
+        `learns_every=3` an iteration is step, step, step, learn. Each `step` is masked, since the
+        training may end at the first or second one.
         """
 
         def step(_: Array, carry: tuple[PyTree, _LoopState]) -> tuple[PyTree, _LoopState]:
             large, state = carry
-            # Masked always: the training may end within these steps.
             large, stepped = self.step(buffer, large, state, consts, masked=True, learns=False)
             return large, jax.tree.map(partial(jnp.where, state.active), stepped, state)
 

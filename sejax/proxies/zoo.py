@@ -149,11 +149,10 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     return from_plain(PretrainedProxy, values, "record")
 
 
-FACTS = ("settings", "scores", "objective", "generation", "seed", "learning", "policy_return")
-
 # --- model cards ----------------------------------------------------------------------------------
 
 _KINDS = {"se": ["synthetic-environment"], "rn": ["reward-network"], "other": []}  # with tags
+_FACTS = ("settings", "scores", "objective", "generation", "seed", "learning", "policy_return")
 _ROW = (  # of an evaluation
     "| {0.agent} | {0.hparams} | {0.world} | {0.return_mean:.1f} ± {0.return_std:.1f} | "
     "{0.train_steps:,.0f} | {0.num_agents} |"
@@ -181,7 +180,7 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
     plain = to_plain(proxy)
     if proxy.learning:
         plain["learning"].pop("command")  # the card shows it below
-    facts = {name: plain[name] for name in FACTS if plain[name] not in (None, "", {})}
+    facts = {name: plain[name] for name in _FACTS if plain[name] not in (None, "", {})}
     values = vars(proxy) | {
         "front": json.dumps(license) if source.startswith(hub.SCHEME) else None,
         "tags": json.dumps(["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]),

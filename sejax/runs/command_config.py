@@ -184,13 +184,13 @@ class CommandConfig(Options, ABC):
         (agent,) = self.agents.values()
         return agent
 
-    def field_of(self, key: str) -> str:
+    def group_of(self, key: str) -> str:
         """The group of an agent's fields in words: `agent`, or `agents.KEY` of several."""
         return typed_name(f"agents.{key}", self.agents)
 
     def agent_for(self, key: str, task: envs.Task, is_varied: bool) -> Agent:
         """The agent of a key, with the exploration, for a task; see `sejax.make_agent`."""
-        with errors_of("agent", self.field_of(key)):
+        with errors_of("agent", self.group_of(key)):
             return agents.make_agent(self.agents[key], task, self.exploration, is_varied)
 
     def plain(self) -> dict[str, Any]:
@@ -211,7 +211,7 @@ class CommandConfig(Options, ABC):
         spec = envs.spec_of(env)
         task_name = registry.name_of("env", env)
         for key, agent in self.agents.items():
-            agents.require_fit(agent, self.exploration, spec, task_name, self.field_of(key))
+            agents.require_fit(agent, self.exploration, spec, task_name, self.group_of(key))
             self.require_learning(key, "training", self.training, proxy, spec)
 
     def require_learning(

@@ -86,12 +86,12 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
         lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]
-    classes += [(config.field_of(key), type(x)) for key, x in config.agents.items()]
+    classes += [(config.group_of(key), type(x)) for key, x in config.agents.items()]
     sources = dict[str, str]()
     for layer, values in layers.items():
         source = "" if layer == "default" else f" ({layer})"
         sources |= dict.fromkeys(config.in_words(values), source)
-    choices = (*command.groups(), *map(config.field_of, config.agents))
+    choices = (*command.groups(), *map(config.group_of, config.agents))
     fields = {name: x for name, x in config.in_words(config.plain()).items() if name not in choices}
     return "\n".join([*lines, field_lines(fields, classes, sources)])
 

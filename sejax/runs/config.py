@@ -196,7 +196,7 @@ def default_agent(tree: Tree) -> str:
     """The default agent of a tree's task."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
         return agents.default_for(envs.spec_of(env_in(tree)))
-    return chosen({}, "agent")
+    return registry.names("agent")[0]
 
 
 def env_in(tree: Tree) -> Any:

@@ -146,7 +146,7 @@ def worlds_of(config: FreshAgentsConfig) -> dict[str, World]:
     proxy = None if config.proxy == "real" else loaded(config)
     task = envs.make(str(config.env)) if proxy is None else proxy.task
     for key, agent in config.agents.items():
-        agents.require_fit(agent, config.exploration, task, task.name, config.field_of(key))
+        agents.require_fit(agent, config.exploration, task, task.name, config.group_of(key))
     trainings = dict.fromkeys(config.agents, config.real_training)
     on_task = World(task.env, task.params, task, trainings, config.agent_hparams == "varied")
     if proxy is None:

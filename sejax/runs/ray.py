@@ -92,7 +92,7 @@ class RayConfig(MachinesConfig):
             rule = f"must be within reach; got {self.address} ({told(error)})"
             raise ConfigError("machines.address", rule, use="local") from error
         try:
-            yield functools.partial(_on_cluster, self)
+            yield functools.partial(_on_cluster, self.workers)
         finally:
             ray.shutdown()
 
@@ -197,7 +197,7 @@ def require_cluster() -> None:
 
 
 def _on_cluster(
-    machines: RayConfig, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]
+    workers: int | None, function: Callable[..., Any], items: Sequence[tuple[Any, ...]]
 ) -> Iterator[Any]:
     """A function's results for tuples of arguments, in their order, each as soon as it is there.
 
@@ -212,7 +212,7 @@ def _on_cluster(
     task = ray.remote(num_cpus=1, max_retries=RETRIES)(call)
     versions = runtime.versions()
     require_cluster()
-    limit = machines.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+    limit = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
     tasks: list[Any] = []  # sent ones, in the order of their items
     running: list[Any] = []
     try:

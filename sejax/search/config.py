@@ -144,7 +144,7 @@ def plan_of(overrides: Sequence[str]) -> StudyPlan:
     default = plan.default
     if plan.config.space is not None:
         by_key = default.agents.items()
-        agents = {default.field_of(key): registry.name_of("agent", x) for key, x in by_key}
+        agents = {default.group_of(key): registry.name_of("agent", x) for key, x in by_key}
         typed = default.in_words(LearnConfig.layers_of(fixed)["typed"])
         for name, dimension in spaces.preset(plan.config.space, agents).items():
             if name not in typed:
