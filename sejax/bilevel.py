@@ -137,7 +137,7 @@ class Bilevel:
     ) -> tuple[LearnState, GenerationInfo]:
         """Scores the outcomes, moves the incumbent, and keeps the best one so far.
 
-        The strategy compares other numbers (`Scoring.search_scores`) than are kept and shown
+        The strategy compares other numbers (`Scoring.candidate_scores`) than are kept and shown
         (`Scoring.shown_scores`). After a run is over nothing changes: each new leaf is dropped.
 
         Of equally good incumbents it keeps the last. Reason: once incumbents reach the task's
@@ -146,7 +146,7 @@ class Bilevel:
         # XLA must not fuse the sums below into the program of the outcome: they would round
         # differently in another program.
         outcome = jax.lax.optimization_barrier(outcome)
-        scores, incumbent_score = self.scoring.search_scores(outcome)
+        scores, incumbent_score = self.scoring.candidate_scores(outcome)
         es_state = self.layout.strategy.tell(
             candidates.key_tell, candidates.population, scores, incumbent_score, candidates.es_state
         )

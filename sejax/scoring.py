@@ -85,7 +85,7 @@ class Scoring:
     objective: Objective
     layout: Layout
 
-    def search_scores(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+    def candidate_scores(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
 
         The scores of a candidate's evaluations become one score here.

@@ -54,7 +54,7 @@ def test_with_common_random_numbers_all_agents_of_a_mixture_have_the_populations
 def test_a_member_has_no_score_if_the_agent_of_one_evaluation_diverged(aggregate, first):
     es = NESConfig(population_size=2, num_evals=2, eval_aggregate=aggregate, num_incumbent_evals=1)
     scores = jnp.array([1.0, 3.0, 2.0, NAN, NAN, 0.0, -4.0, -4.0, 5.0])
-    told, incumbent = scoring_of(es).search_scores(outcome_of(scores))
+    told, incumbent = scoring_of(es).candidate_scores(outcome_of(scores))
     np.testing.assert_array_equal(told, [first, NAN, NAN, -4.0])
     assert incumbent == 5
 

@@ -15,7 +15,7 @@ from sejax.gym.tasks import Env, Info, RealTask, signature
 from sejax.options import Fraction, checked, require, shortened
 from sejax.options.plain import configure
 from sejax.proxies import MAX_ABS_VALUE
-from sejax.proxies.header import Header, check_tensors, configured, is_registered, read
+from sejax.proxies.header import Header, check_tensors, configured, is_known, read
 from sejax.proxies.reward import RewardConfig
 
 # Wrappers of observations that change no number, and wrappers that change rewards.
@@ -67,7 +67,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], utils.RecordConstruct
         keys: tuple[str, ...] = ()
         if weighs_info or self.config.augmented:  # the task's configuration has the keys
             rule = "must be of a task with a registered name, which says what info the RN reads"
-            require(is_registered("env", header.config["env"]), "source", rule, got=header.task)
+            require(is_known("env", header.config["env"]), "source", rule, got=header.task)
             spec = envs.spec_of(configured("env", header.config["env"], "source"))
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]

@@ -7,7 +7,7 @@ step                               its score
 ================================== ================================================================
 `Objective.search_scores`,         nan
 `Objective.shown_scores`
-`Scoring.search_scores`            nan for its candidate
+`Scoring.candidate_scores`         nan for its candidate
 `scoring.with_diverged_last`       on the incumbent: the lowest one of its algorithm in the
                                    generation; nan if all trainings with the algorithm diverged
 `Mixture.comparable`               stays nan

@@ -109,7 +109,7 @@ def _size_of(space: Space) -> int:
     return space.size if all(low <= high for low, high in bounds) else 0
 
 
-def is_registered(group: str, stored: object) -> bool:
+def is_known(group: str, stored: object) -> bool:
     """Whether plain values name what sejax or an installed package has registered."""
     return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
 
@@ -125,7 +125,7 @@ def configured(group: str, values: object, where: str) -> Any:
     Raises:
       ConfigError: if there are no values, or their name is not registered.
     """
-    if is_registered(group, values):
+    if is_known(group, values):
         require_typed({group: values})
         return configure(group, values)
     name = values.get("name") if isinstance(values, Mapping) else "none"

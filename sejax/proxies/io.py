@@ -228,7 +228,7 @@ def training_of(
     if agent is None or training.max_steps is None or to_plain(agent, "agent") in agents:
         return training
     registry.require_part("agent", AgentConfig, agent, "Pass an object, such as sejax.PPOConfig().")
-    registered = [x for x in agents if header.is_registered("agent", x)]
+    registered = [x for x in agents if header.is_known("agent", x)]
     learned = [header.configured("agent", x, env.name) for x in registered]
     wait = max((x.steps_before_learning(*limits) for x in learned), default=0)
     longer = max(0, agent.steps_before_learning(*limits) - wait)

@@ -144,7 +144,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
         "task": learned.task,
         "settings": config["proxy"],
         "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
-        "needs": [x for x in header.GIVEN if not header.is_registered(x, config[x])],
+        "needs": [x for x in header.GIVEN if not header.is_known(x, config[x])],
     }
     return from_plain(PretrainedProxy, values, "record")
 

@@ -82,7 +82,7 @@ def help_of(command: type[CommandConfig], about: str | None, overrides: Sequence
         lines += [textwrap.fill(f"  {group}: {names}", 98, subsequent_indent=" " * 6)]
     lines += ["  agents: [agent,agent,...]"]
     if "preset" in vars(config):
-        known = presets.sections_of(*(presets.chosen(tree, x) for x in ("env", "proxy")))
+        known = presets.sections_of(*(presets.choice_in(tree, x) for x in ("env", "proxy")))
         lines += [f"  preset: {', '.join([*known, 'FILE.yaml'])}"]
     lines += ["", "Fields of these choices (field=value), with their values:"]
     classes = [("", command), *((name, type(x)) for name, x in vars(config).items())]

@@ -17,7 +17,7 @@ from sejax.options import ConfigError, Count, Options, old, registry, require
 from sejax.options.plain import configure, merge, plugin, require_typed, unknown_field
 from sejax.proxies import ProxyConfig
 from sejax.runs.command_config import PLACES, CommandConfig
-from sejax.runs.presets import chosen, preset_of
+from sejax.runs.presets import choice_in, preset_of
 from sejax.runs.trackers import Tracker
 from sejax.runs.words import Tree, agent_names
 
@@ -205,4 +205,4 @@ def env_in(tree: Tree) -> Any:
     Raises:
       ConfigError: if the tree describes no task that may be made.
     """
-    return configure("env", {"name": chosen(tree, "env")} | tree.get("env", {}))
+    return configure("env", {"name": choice_in(tree, "env")} | tree.get("env", {}))

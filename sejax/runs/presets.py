@@ -42,7 +42,7 @@ def _sections_in(stem: str, known: dict[str, Tree]) -> dict[str, Tree]:
     return sections
 
 
-def chosen(tree: Tree, group: str) -> str:
+def choice_in(tree: Tree, group: str) -> str:
     """The name of a group's choice in a tree; sejax's own first one if the tree has none."""
     return str(tree.get(group, {}).get("name", registry.names(group)[0]))
 
@@ -65,12 +65,12 @@ def preset_of(typed: Tree) -> Tree:
       (200, 199)
     """
     name = str(typed.get("preset", "best"))
-    env, proxy, es = (chosen(typed, group) for group in ("env", "proxy", "es"))
+    env, proxy, es = (choice_in(typed, group) for group in ("env", "proxy", "es"))
     sections = sections_of(env, proxy)
     require_known("preset", name, sections)
     section = sections[name]
     default = {"objective": {"name": registry.find("proxy", proxy).default_objective}}
-    objective = chosen(merge(default, section, typed), "objective")
+    objective = choice_in(merge(default, section, typed), "objective")
     of_names = section.get("with_agent", {})
     by_key = {key: of_names.get(x, {}) for key, x in agent_names(typed["agents"]).items()}
     settings = merge(
