@@ -234,7 +234,9 @@ def _others(config: CheckConfig, task: Task) -> Agents:
     names = agents.fitting(task) if config.algorithms is None else config.algorithms
     known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
     again = known & {*(config.algorithms or ())}
-    require(not again, "algorithms", "must be none of its own agents", got=", ".join(sorted(again)))
+    use = as_text([x for x in agents.fitting(task) if x not in known])
+    rule = "must be none of its own agents"
+    require(not again, "algorithms", rule, got=", ".join(sorted(again)), use=use)
     with errors_of("agent", "algorithms"):
         others = {x: configure("agent", {"name": x}) for x in names if x not in known}
     for key, agent in (learned | others).items():

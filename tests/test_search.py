@@ -92,8 +92,8 @@ def test_hyperband_ends_trials_that_are_behind(tmp_path, learning):
     current = worked(tmp_path, "trials=10", *THREE)
     lasted = {x.state.name: x.user_attrs["generations"] for x in current.trials}
     assert lasted == {"PRUNED": 1, "COMPLETE": 3}
-    total = sum(trial.user_attrs["generations"] for trial in current.trials)
-    assert len(learning.ran) == total  # a pruned trial stops at once
+    # A pruned trial stops at once.
+    assert len(learning.ran) == sum(trial.user_attrs["generations"] for trial in current.trials)
     assert current.best_params["es.noise_std"] == max(drawn(current))
 
 
@@ -222,9 +222,10 @@ def test_a_database_that_is_none_is_refused(tmp_path):
     assert refused(command.main, [SPACE, f"search_dir={tmp_path}"]) == "search_dir"
 
 
-def test_a_changed_score_is_refused(tmp_path, learning):
+@pytest.mark.parametrize("number", ["trial_values SET value", "trial_params SET param_value"])
+def test_a_changed_number_is_refused(tmp_path, learning, number):
     worked(tmp_path, *ONE, "trials=1")
-    sqlite3.connect(tmp_path / "study.db").executescript("UPDATE trial_values SET value = 1e9")
+    sqlite3.connect(tmp_path / "study.db").executescript(f"UPDATE {number} = 0.123")
     assert refused(command.main, [SPACE, *ONE, f"search_dir={tmp_path}"]) == "search_dir"
 
 

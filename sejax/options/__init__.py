@@ -144,7 +144,7 @@ def listed(names: Collection[str]) -> str:
 
 def shortened(value: object, length: int = 80) -> str:
     """A value as text that leaves room for the rest of a message."""
-    text = str(value).replace("\n", "\\n")
+    text = "".join(x if x.isprintable() else repr(x)[1:-1] for x in str(value))
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
 
 
@@ -299,7 +299,9 @@ def checked(value: Any, hint: Any, name: str, default: Any) -> Any:
         if problem["type"] == "tuple_type" and not str(got).startswith("["):
             use = f"[{shortened(got, 20)}]"
             raise ConfigError(name, "must be a list in brackets", got=repr(got), use=use) from None
-        rule = problem["msg"].replace("Input should", "must").partition(", unable")[0]
+        rule = problem["msg"].partition(", unable")[0]
+        is_rule = rule.startswith("Input should")
+        rule = rule.replace("Input should", "must") if is_rule else f"must fit its type: {rule}"
         for bound, words in (("ge", "at least"), ("le", "at most")):
             if bound in problem.get("ctx", {}):
                 rule = f"must be {words} {problem['ctx'][bound]}"

@@ -11,7 +11,7 @@ GONE |= {f"agent.{x}": 1 for x in ("train_every", "gradient_steps", "target_upda
 GONE |= {"baseline": True, "agent.noisy_tests": False, "mixture.compared_by": "advantage"}
 GONE |= {"proxy.reward_slope": 1.0, "proxy.horizon_is_terminal": True, "num_seeds": 1}
 # What says the same today.
-INSTEAD = dict.fromkeys(("num_seeds", "seeds"), "seed=0,1,2")
+INSTEAD = dict.fromkeys(("num_seeds", "seeds"), "seed=0, or in a sweep seed=0,1,2")
 
 
 def is_gone(field: str, value: object) -> bool:

@@ -210,9 +210,10 @@ def _read(value: Any, hint: Any, name: str, default: Any, group: str | None) -> 
         reading = parsed(value)
     elif type(value) in (int, float):
         value = str(value)  # it may be a name of digits, such as a folder's
-    with suppress(ConfigError):
-        return checked(reading, hint, name, default)
-    return checked(value, hint, name, default)
+    for read in (reading, value):
+        with suppress(ConfigError):
+            return checked(read, hint, name, default)
+    return checked(reading if isinstance(reading, list) else value, hint, name, default)
 
 
 # --- nested dictionaries -------------------------------------------------------------------------

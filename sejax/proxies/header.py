@@ -123,11 +123,15 @@ def configured(group: str, values: object, where: str) -> Any:
       where: the file, for messages.
 
     Raises:
-      ConfigError: if there are no values, or their name is not registered.
+      ConfigError: if there are no values, their name is not registered, or one does not fit.
     """
     if is_known(group, values):
         require_typed({group: values})
-        return configure(group, values)
+        try:
+            return configure(group, values)
+        except ConfigError as error:
+            error.rule += f" in {shortened(where, 40)}"
+            raise
     name = values.get("name") if isinstance(values, Mapping) else "none"
     argument, word = GIVEN.get(group, (group, group))
     rule = f"must be given for {shortened(where, 40)}, as code that a file names is never imported"

@@ -68,6 +68,9 @@ def open_study(plan: StudyPlan) -> optuna.Study:
                 score = trial.intermediate_values.get(budgets[1], trial.value)
                 if trial.state == TrialState.COMPLETE and trial.value != score:
                     raise ValueError(f"trial {trial.number} has two scores")
+                settings = trial.user_attrs.get("settings")
+                if settings and settings != shlex.join(plan.overrides(trial.params)):
+                    raise ValueError(f"trial {trial.number} has two settings")
         except (KeyError, TypeError, ValueError) as error:  # somebody else has written there
             raise optuna.exceptions.StorageInternalError(told(error)) from error
         if is_new:
