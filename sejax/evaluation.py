@@ -69,45 +69,42 @@ class _Episode(struct.PyTreeNode):
     env_state: PyTree
 
 
-def _greedy(
-    agent: Agent, env: Environment
-) -> tuple[Callable[..., _Episode], Callable[..., tuple[_Episode, Steps]]]:
-    """Builds two functions: one begins a greedy episode, the other makes a step of it.
+def _begun(env: Environment, key: Array, active: Array | bool, params: PyTree) -> _Episode:
+    """A greedy episode before its first step."""
+    obs, env_state = env.reset_env(key, params)
+    return _Episode(
+        active=jnp.asarray(active),
+        num_steps=jnp.int32(0),
+        total=jnp.float32(0),
+        scored=jnp.float32(0),
+        obs=obs,
+        env_state=env_state,
+    )
 
-    They are `(key, active, params) -> episode` and `(key, agent_state, before, params) -> (after,
-    steps)`. The step takes the key of the whole episode.
-    """
 
-    def begin(key: Array, active: Array | bool, params: PyTree) -> _Episode:
-        obs, env_state = env.reset_env(key, params)
-        return _Episode(
-            active=jnp.asarray(active),
-            num_steps=jnp.int32(0),
-            total=jnp.float32(0),
-            scored=jnp.float32(0),
-            obs=obs,
-            env_state=env_state,
-        )
-
-    def step(
-        key: Array, agent_state: AgentState, before: _Episode, params: PyTree
-    ) -> tuple[_Episode, Steps]:
-        key_act, key_env = step_keys(key, before.num_steps, 2)
-        action = agent.env_action(agent.act(key_act, agent_state, before.obs, explore=False))
-        obs, env_state, reward, terminated, info = env.step_env(
-            key_env, before.env_state, action, params
-        )
-        after = _Episode(
-            active=~(terminated | env.is_truncated(env_state, params)),
-            num_steps=before.num_steps + info.get("sejax_num_steps", 1),
-            total=before.total + reward,
-            scored=before.scored + info.get("scored_reward", reward),
-            obs=obs,
-            env_state=env_state,
-        )
-        return after, Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
-
-    return begin, step
+def _stepped(
+    agent: Agent,
+    env: Environment,
+    key: Array,
+    agent_state: AgentState,
+    before: _Episode,
+    params: PyTree,
+) -> tuple[_Episode, Steps]:
+    """A greedy episode after one more step, and that step; `key` is that of the whole episode."""
+    key_act, key_env = step_keys(key, before.num_steps, 2)
+    action = agent.env_action(agent.act(key_act, agent_state, before.obs, explore=False))
+    obs, env_state, reward, terminated, info = env.step_env(
+        key_env, before.env_state, action, params
+    )
+    after = _Episode(
+        active=~(terminated | env.is_truncated(env_state, params)),
+        num_steps=before.num_steps + info.get("sejax_num_steps", 1),
+        total=before.total + reward,
+        scored=before.scored + info.get("scored_reward", reward),
+        obs=obs,
+        env_state=env_state,
+    )
+    return after, Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
 
 
 def make_tester(
@@ -128,7 +125,7 @@ def make_tester(
       test_env: maps the task's environment, with the agent's action repeat, to the environment of
         the episodes; by default the same one.
     """
-    begin, decide = _greedy(agent, test_env(repeat_actions(task.env, agent.spec.action_repeat)))
+    env = test_env(repeat_actions(task.env, agent.spec.action_repeat))
 
     def step(
         nothing: Array, state: _Episode, consts: PyTree, masked: bool
@@ -136,11 +133,11 @@ def make_tester(
         key, agent_state, params = consts
         # Resolved here too: as a part of `consts` the task's would be no constants to XLA.
         params = task.params if params is None else params
-        return nothing, decide(key, agent_state, state, params)[0]
+        return nothing, _stepped(agent, env, key, agent_state, state, params)[0]
 
     def episode(key: Array, agent_state: AgentState, active: Array | bool, params: PyTree) -> Tests:
         key_reset, key_steps = jax.random.split(key)
-        state = begin(key_reset, active, task.params if params is None else params)
+        state = _begun(env, key_reset, active, task.params if params is None else params)
         _, state = while_any_active(step, jnp.zeros(0), state, (key_steps, agent_state, params))
         return Tests(state.total, state.num_steps, state.scored)
 
@@ -161,16 +158,16 @@ def make_recorder(
     The episodes are those of `make_tester` with the same key. A decision is one step here, even if
     the agent repeats its action: an episode has `max_steps / action_repeat` of them, rounded up.
     """
-    begin, decide = _greedy(agent, repeat_actions(task.env, agent.spec.action_repeat))
+    env = repeat_actions(task.env, agent.spec.action_repeat)
 
     def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
-            after, steps = decide(key_steps, agent_state, state, task.params)
+            after, steps = _stepped(agent, env, key_steps, agent_state, state, task.params)
             return after.replace(active=state.active & after.active), steps
 
-        start = begin(key_reset, True, task.params)
+        start = _begun(env, key_reset, True, task.params)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
     def record(key: Array, agent_state: AgentState) -> Steps:
