@@ -24,7 +24,7 @@ from sejax.distill.policy_search import (
     Policy,
     PolicySearchConfig,
     first_policy,
-    linear_act,
+    linear_agent,
     make_search,
 )
 from sejax.envs.base import Task
@@ -204,7 +204,7 @@ def search_teacher(task: Task, real_steps: int, seed: int) -> Teacher:
 def _search(task: Task) -> tuple[sejax.Agent, Policy, Callable[..., Any]]:
     """The linear policy as an agent, one that does nothing, and a compiled, tested generation."""
     search = make_search(PolicySearchConfig(**ARS), task)
-    agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
+    agent = linear_agent(task)
 
     def generation(key: Array, policy: Policy) -> tuple[Policy, Array, Any]:
         key_search, key_test = jax.random.split(key)

@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
 
+from sejax.agents.base import Agent
 from sejax.envs.base import Task
 from sejax.evaluation import Steps, Tests, make_fixed, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
@@ -133,12 +134,16 @@ def first_policy(task: Task) -> Policy:
     return Policy(jnp.zeros((task.action_dim, task.obs_dim + 1)), jnp.float32(0), zeros, zeros)
 
 
-def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
-    """The action of a linear policy."""
-    outputs = policy.weights @ jnp.append((obs - policy.mean) / policy.std, 1.0)
-    if task.num_actions is not None:
-        return jnp.argmax(outputs).astype(jnp.int32)
-    return task.max_action * jnp.clip(outputs, -1.0, 1.0)
+def linear_agent(task: Task) -> Agent:
+    """An agent whose state is a `Policy`, and which learns nothing."""
+
+    def act(key: Array, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
+        outputs = policy.weights @ jnp.append((obs - policy.mean) / policy.std, 1.0)
+        if task.num_actions is not None:
+            return jnp.argmax(outputs).astype(jnp.int32)
+        return task.max_action * jnp.clip(outputs, -1.0, 1.0)
+
+    return make_fixed(task, act)
 
 
 def make_search(config: PolicySearchConfig, task: Task, devices: int | None = None) -> Search:
@@ -162,7 +167,7 @@ def make_search(config: PolicySearchConfig, task: Task, devices: int | None = No
       ((3, 3), (8,))
     """
     require_vectors(task, task.name)
-    agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
+    agent = linear_agent(task)
     shape = (task.action_dim, task.obs_dim + 1)
     play, record_one = make_tester(agent, task, 1), make_recorder(agent, task, 1)
     width = 1 if task.num_actions is None else None
