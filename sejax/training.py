@@ -398,26 +398,23 @@ class _Loop:
         # Keys of the last step, which did not learn.
         keys = _StepKeys.of(consts.key, state.step - 1)
         is_full = state.step == first_step + buffer.learns_every
-        agent_state = self.learn(state, buffer, stored, state.step, keys, is_due=is_full)
-        return large, state.replace(agent_state=agent_state)
+        return large, self.learn(state, buffer, stored, keys, is_due=is_full)
 
     def learn(
         self,
         state: _LoopState,
         buffer: Buffer,
         stored: PyTree,
-        num_steps: Array,
         keys: _StepKeys,
         transition: Transition | None = None,
         is_due: Array | bool = True,
-    ) -> AgentState:
+    ) -> _LoopState:
         """One update of the agent, if it is due.
 
         Args:
-          state: of the loop.
+          state: of the loop, with the last step counted.
           buffer: what the agent learns from.
           stored: the buffer's arrays.
-          num_steps: steps so far.
           keys: of the last step.
           transition: the last step's; None after a rollout, which has stored it.
           is_due: whether the agent learns now, if its episodes of warm-up are over.
@@ -425,11 +422,12 @@ class _Loop:
 
         def update(agent_state: AgentState) -> AgentState:
             in_use = self.agent.batch_size(agent_state)
-            batch = buffer.batch(keys.sample, stored, num_steps, transition, in_use)
+            batch = buffer.batch(keys.sample, stored, state.step, transition, in_use)
             return self.agent.update(keys.update, agent_state, batch)
 
         is_due &= state.episode >= self.agent.spec.learns_from
-        return jax.lax.cond(is_due, update, lambda agent_state: agent_state, state.agent_state)
+        agent_state = jax.lax.cond(is_due, update, lambda same: same, state.agent_state)
+        return state.replace(agent_state=agent_state)
 
     def step(
         self,
@@ -475,20 +473,18 @@ class _Loop:
         active = state.active if masked else True
         finished = ended & active  # not in a training that is over
         stored = buffer.store(stored, state.step, transition, ended, active)
-        agent_state = state.agent_state
+        state = state.replace(step=state.step + 1)
         if learns:
-            agent_state = self.learn(state, buffer, stored, state.step + 1, keys, transition)
+            state = self.learn(state, buffer, stored, keys, transition)
         train_steps = state.train_steps + info.get("sejax_num_steps", 1)
         # The episode's row of the curve; one that is out of range is dropped.
         row = jnp.where(finished, state.episode, self.training.max_episodes)
         episode_return = state.episode_return + reward
         state = state.replace(
-            step=state.step + 1,
             train_steps=train_steps,
             episode_return=episode_return,
             obs=next_obs,
             env_state=env_state,
-            agent_state=agent_state,
             nonfinite=nonfinite,
             active=state.active & (train_steps < (self.training.max_steps or LARGEST)),
         )
