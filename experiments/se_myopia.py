@@ -25,7 +25,6 @@ from experiments.common.experiment import Experiment, Settings, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import worst_tenth
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
-from sejax.agents.base import with_hparams
 from sejax.myopia import MARGIN, judge
 from sejax.options import Count, require
 from sejax.options.plain import configure
@@ -96,7 +95,7 @@ def make_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Any:
 
     def run(key: Any, params: tuple[Any, Any], active: Any) -> Any:
         discount, env_params = params
-        hparams = with_hparams(agent.hparams, {"discount": discount})
+        hparams = agent.hparams.replace_innermost(discount=discount)
         sighted = dataclasses.replace(agent, hparams=hparams)
         return sejax.make_evaluator(sighted, env, task, training)(key, env_params, active)
 

@@ -56,6 +56,12 @@ class Hparams(SimpleNamespace):
         """The same hyperparameters but for these."""
         return type(self)(**vars(self) | values)
 
+    def replace_innermost(self, **values: PyTree) -> Self:
+        """As `replace`; of an agent with an intrinsic reward, for the agent inside, at `agent`."""
+        if hasattr(self, "agent"):
+            return self.replace(agent=self.agent.replace_innermost(**values))
+        return self.replace(**values)
+
     def tree_flatten(self) -> tuple[tuple[PyTree, ...], tuple[str, ...]]:
         return tuple(vars(self).values()), tuple(vars(self))
 
@@ -283,17 +289,6 @@ def traced(config: Options) -> Hparams:
     cls = type(config)
     names = [field.name for field in fields(cls) if marks(cls, field.name).get("traced")]
     return Hparams(**{name: getattr(config, name) for name in names})
-
-
-def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
-    """Traced hyperparameters with these values in place of theirs.
-
-    The values belong to the innermost agent: in an agent with an intrinsic reward, to the one whose
-    hyperparameters are in the field `agent`.
-    """
-    if hasattr(hparams, "agent"):
-        return hparams.replace(agent=with_hparams(hparams.agent, values))
-    return hparams.replace(**values)
 
 
 class Algorithm(ABC):

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, AgentConfig, Drawn, Varied, with_hparams
+from sejax.agents.base import Agent, AgentConfig, Drawn, Varied
 from sejax.ops import cpu
 from sejax.options import marks, require
 
@@ -122,7 +122,7 @@ def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Ag
         drawn = map(draw_value, jax.random.split(key, len(ranges)), ranges.values())
         values = dict(zip(ranges, drawn, strict=True))
         traced = {name: x for name, x in values.items() if name != "num_layers"}
-        hparams = with_hparams(variants[0].hparams, traced)
+        hparams = variants[0].hparams.replace_innermost(**traced)
         depth = values.get("num_layers", jnp.zeros(()))
         units = values.get("hidden_size", jnp.zeros(()))
         too_small = [(n < depth) | ((n == depth) & (size < units)) for n, size in shapes]
