@@ -71,8 +71,8 @@ def test_layers_do_what_the_policy_does(task):
         jnp.asarray(RNG.uniform(1, 9, d), jnp.float32),
     )
     obs = RNG.normal(size=(30, d)).astype(np.float32)
-    act = linear_agent(task).act
-    wanted = jax.vmap(lambda x: act(jax.random.key(0), policy, x, explore=False))(obs)
+    # The action draws nothing.
+    wanted = jax.vmap(lambda x: linear_agent(task).act(None, policy, x, explore=False))(obs)
     got = acting(task, policy.layers(task.max_action))(obs)
     np.testing.assert_allclose(got, wanted, atol=1e-4)
 
