@@ -120,7 +120,7 @@ class ActorCritic(OffPolicy):
         actor = init_narrowed(self.actor, key_actor, self.obs_dim, size)
         return actor, init_critics(jax.random.split(key_critics))
 
-    def outputs(self, actor: PyTree, obs: Array) -> Float[Array, "outputs *batch"]:
+    def actor_outputs(self, actor: PyTree, obs: Array) -> Float[Array, "outputs *batch"]:
         """The actor's outputs."""
         return cast(Array, self.actor.apply(actor, obs))
 

@@ -209,7 +209,7 @@ class PPO(Algorithm):
 
     def act(self, key: Array, state: PPOState, obs: Array, explore: bool) -> Array:
         outputs = cast(Array, self.actor.apply(state.params["actor"], obs))
-        return self.sample(key, outputs, state.params["std"]) if explore else self.mode(outputs)
+        return self.sample(key, outputs, state.params["std"]) if explore else self.best(outputs)
 
     def value(self, params: PyTree, obs: Array) -> PerStep:
         """The critic's values."""
@@ -320,7 +320,7 @@ class PPO(Algorithm):
         """An action, for one observation."""
         return jax.random.categorical(key, outputs).astype(jnp.int32)
 
-    def mode(self, outputs: Array) -> Array:
+    def best(self, outputs: Array) -> Array:
         """The likeliest action, for one observation."""
         return jnp.argmax(outputs).astype(jnp.int32)
 
@@ -346,13 +346,13 @@ class ContinuousPPO(PPO):
     max_action: float
 
     def sample(self, key: Array, outputs: Array, std: Array) -> Array:
-        return self.mode(outputs) + std * jax.random.normal(key, outputs.shape)
+        return self.best(outputs) + std * jax.random.normal(key, outputs.shape)
 
-    def mode(self, outputs: Array) -> Array:
+    def best(self, outputs: Array) -> Array:
         return self.max_action * jnp.tanh(outputs)
 
     def probabilities(self, outputs: Array, std: Array, action: Array) -> tuple[PerStep, PerStep]:
-        standardized = (action - self.mode(outputs)) * (1 / std)[:, None]
+        standardized = (action - self.best(outputs)) * (1 / std)[:, None]
         log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
         log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
         return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)

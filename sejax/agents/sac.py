@@ -126,7 +126,7 @@ class SAC(ActorCritic):
         return cast(Array, jax.vmap(self.critic.apply, (0, None))(critics, inputs))
 
     def act(self, key: Array, state: SACState, obs: Array, explore: bool) -> Array:
-        outputs = self.outputs(state.params.actor, obs)
+        outputs = self.actor_outputs(state.params.actor, obs)
         return self.sample(key, outputs, state.is_warming_up) if explore else self.best(outputs)
 
     def update(self, key: Array, state: SACState, batch: Transition) -> SACState:
@@ -170,14 +170,14 @@ class SAC(ActorCritic):
         hp = state.hparams
         fixed = jax.lax.stop_gradient(params)
         alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
-        next_outputs = self.outputs(fixed.actor, batch.next_obs)
+        next_outputs = self.actor_outputs(fixed.actor, batch.next_obs)
         next_q, next_entropy = self.expected(
             state.target_critics, batch.next_obs, next_outputs, noise.next_action
         )
         targets = batch.reward + hp.discount * batch.discount * (next_q + alpha * next_entropy)
         errors = self.q_values(params.critics, batch.obs, batch.action) - targets
         q_value, entropy = self.expected(
-            fixed.critics, batch.obs, self.outputs(params.actor, batch.obs), noise.action
+            fixed.critics, batch.obs, self.actor_outputs(params.actor, batch.obs), noise.action
         )
         losses = 0.5 * jnp.sum(errors**2, axis=0) - (q_value + alpha * entropy)
         if hp.alpha is None:

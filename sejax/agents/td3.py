@@ -147,7 +147,7 @@ class TD3(ActorCritic):
         )
 
     def act(self, key: Array, state: TD3State, obs: Array, explore: bool) -> Array:
-        outputs = self.outputs(state.actor, obs)
+        outputs = self.actor_outputs(state.actor, obs)
         if not explore:
             return self.best(outputs)
         key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
@@ -205,7 +205,7 @@ class TD3(ActorCritic):
         critic = jax.tree.map(lambda x: x[0], state.critics)
 
         def sum_of_losses(actor: PyTree, batch: Transition, noise: LearningNoise) -> Array:
-            action = self.action(self.outputs(actor, batch.obs), noise.policy, state)
+            action = self.action(self.actor_outputs(actor, batch.obs), noise.policy, state)
             return -jnp.sum(batch.weight * self.q_value(critic, batch.obs, action))
 
         actor, opt_state = adam_step(
@@ -230,7 +230,8 @@ class TD3(ActorCritic):
         hp = state.hparams
         clip = hp.target_noise_clip
         smoothing = jnp.clip(hp.target_noise_std * noise.smoothing, -clip, clip)
-        action = self.action(self.outputs(state.target_actor, obs), noise.target_policy, state)
+        outputs = self.actor_outputs(state.target_actor, obs)
+        action = self.action(outputs, noise.target_policy, state)
         return self.restrict(action + self.max_action * smoothing)
 
     # Methods that discrete actions override.
