@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from experiments.common import reward_networks, rn_curves
-from experiments.common.experiment import Experiment
+from experiments.common.experiment import Experiment, setting
 from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
 
@@ -33,7 +33,7 @@ class RnPerformance(CurveSettings):
 
     name = "rn_performance"
 
-    objective: str = reward_networks.objective_setting()
+    objective: str = setting("reward_threshold", reward_networks.OBJECTIVES)
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:

@@ -204,11 +204,6 @@ class RnSettings(RunSettings):
         return self.folder / "rns" if self.quick else Path("results/reward_networks")
 
 
-def objective_setting() -> Any:
-    """The setting of experiments that use the RNs of one objective."""
-    return setting("reward_threshold", OBJECTIVES)
-
-
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)

@@ -41,7 +41,6 @@ from sejax.training import TrainingConfig
 
 # How many steps students train by default, by kind of actions.
 STEPS = {"continuous": 10_000, "discrete": 2000}
-ONE_STEP = SyntheticConfig()  # the form of the SEs
 BEGUN = "distill"  # the entry that says whose folder it is
 CHOOSE, TEST = "choose", "test"  # what students are for
 
@@ -83,7 +82,7 @@ class DistillConfig(CommandConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_vectors(envs.spec_of(self.env), registry.name_of("env", self.env))
-        self.require_agents(self.env, ONE_STEP)
+        self.require_agents(self.env, SyntheticConfig())  # as of a one-step SE
 
     @classmethod
     def default_layers(cls, typed: Tree) -> dict[str, Tree]:

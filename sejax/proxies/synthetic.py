@@ -223,8 +223,7 @@ class SyntheticEnv(ProxyEnv):
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The networks' raw outputs: next state, reward and done output d."""
         inputs = self._inputs(vector, action)
-        outputs = [self._apply(weights, name, inputs) for name in ("state", "reward", "done")]
-        state, reward, done = outputs
+        state, reward, done = (self._apply(weights, x, inputs) for x in ("state", "reward", "done"))
         return self._units.decode(state), reward[0], done[0]
 
     def _inputs(self, vector: Float[Array, " obs_dim"], action: Array) -> Float[Array, " inputs"]:
