@@ -18,8 +18,9 @@ import pandas as pd
 import sejax
 from experiments.common.experiment import Settings
 from sejax import Proxy, ProxySet, Task, TrainingConfig, envs
-from sejax.agents import NoExploration
+from sejax.agents import Agent, AgentConfig, ExplorationConfig, NoExploration
 from sejax.agents.varied import for_keys
+from sejax.envs.environment import Environment
 from sejax.ops.parallel import spread_over_devices
 from sejax.options.plain import configure, to_plain
 from sejax.training import cpu_num_parallel_of
@@ -49,12 +50,12 @@ class Condition:
     """Which agents are trained, in which environment, and how long."""
 
     name: str  # in the names of files
-    env: Any  # gymnax environment; its groups differ in the `params`
+    env: Environment  # its groups differ in the `params`
     task: Task  # the real one, that agents are tested on
     groups: tuple[Group, ...]
-    agent: Any  # configuration of all
+    agent: AgentConfig  # of all
     training: TrainingConfig
-    exploration: Any = field(default_factory=NoExploration)
+    exploration: ExplorationConfig = field(default_factory=NoExploration)
     hparams: str = "default"  # or "varied": drawn for each agent
     settings: dict[str, Any] = field(default_factory=dict)  # what else results depend on; plain
     is_single: bool = False  # whether its one group takes its keys from the seed itself
@@ -89,7 +90,7 @@ class Measure:
     """What is kept of an agent's training."""
 
     # (agent, env, task, training) -> run(key, env_params, active), with leaves `[]` and `[episode]`
-    make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
+    make_run: Callable[[Agent, Environment, Task, TrainingConfig], Callable[..., Any]]
     # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
     is_timed: bool = False  # whether rows have a column `cpu_s`, the cost of an agent
@@ -197,8 +198,8 @@ def train(
 @functools.lru_cache(maxsize=80)
 def make_program(
     measure: Measure,
-    agent: Any,
-    env: Any,
+    agent: Agent,
+    env: Environment,
     task: Task,
     training: TrainingConfig,
     devices: int | None,
@@ -269,7 +270,7 @@ ON_REAL_TASKS = {
 }
 
 
-def tuned_agent(env: str, kind: str) -> Any:
+def tuned_agent(env: str, kind: str) -> AgentConfig:
     """The agent of that kind with what was found on real tasks for few steps (docs/agents.md)."""
     words = ON_REAL_TASKS.get((env, kind), ())
     return sejax.config([f"env={env}", f"agent={kind}", *words]).agent
@@ -297,12 +298,12 @@ SE_AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
 
 
-def agent_config(kind: str) -> Any:
+def agent_config(kind: str) -> AgentConfig:
     """The default configuration of a kind of agent."""
     return configure("agent", {"name": kind})
 
 
-def paper_agent(kind: str) -> Any:
+def paper_agent(kind: str) -> AgentConfig:
     """An agent of the paper's performance figures, around which hyperparameters are drawn.
 
     Source: paper, table of the hyperparameter ranges of SEs; the authors' performance files.

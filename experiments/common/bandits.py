@@ -19,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 import sejax
+from sejax.agents import AgentConfig
 from sejax.check import ARS
 from sejax.distill.policy_search import (
     Policy,
@@ -158,7 +159,7 @@ def _hand(task: Task) -> sejax.Agent:
 
 
 @functools.cache
-def trained(task: Task, config: Any, real_steps: int, seed: int) -> Teacher:
+def trained(task: Task, config: AgentConfig, real_steps: int, seed: int) -> Teacher:
     """An agent of this configuration that trains on the real task for a number of steps."""
     agent = sejax.make_agent(config, task)
     key_train, key_copy = jax.random.split(jax.random.key(seed))

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.agents import Measure
-from sejax import Task, TrainingConfig
+from sejax import Agent, Task, TrainingConfig
+from sejax.envs.environment import Environment
 from sejax.evaluation import make_tested_trainer
 from sejax.ops.scores import reaches
 
@@ -20,14 +21,14 @@ DECIMALS = 2  # of stored test returns
 
 
 def make_curve_run(
-    agent: Any, env: Any, task: Task, training: TrainingConfig
+    agent: Agent, env: Environment, task: Task, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active) -> (test returns, training steps)`, `[episode]` each.
 
     Entries after an agent's last episode are nan and 0.
     """
 
-    def make_run(agent: Any) -> Callable[..., Any]:
+    def make_run(agent: Agent) -> Callable[..., Any]:
         train = make_tested_trainer(agent, env, task, training)
 
         def run(key: Any, env_params: Any, active: Any, hparams: Any) -> Any:

@@ -15,6 +15,7 @@ from experiments.common.agents import OUTCOMES, Condition, Group
 from experiments.common.experiment import Settings, setting
 from experiments.common.shards import stack
 from sejax import Proxy, Task, TrainingConfig, options
+from sejax.agents import AgentConfig
 from sejax.options import Count, registry
 from sejax.proxies.header import pretrained_files
 
@@ -163,7 +164,7 @@ class Study:
         )
 
     def row(
-        self, role: str, kind: str, agent: Any, training: TrainingConfig, **more: Any
+        self, role: str, kind: str, agent: AgentConfig, training: TrainingConfig, **more: Any
     ) -> pd.DataFrame:
         """Agents of one sort, in five groups."""
         condition = self.condition(role, agent, training, **more)
@@ -173,7 +174,7 @@ class Study:
     def condition(
         self,
         name: str,
-        agent: Any,
+        agent: AgentConfig,
         training: TrainingConfig,
         num_groups: int = NUM_GROUPS,
         **more: Any,

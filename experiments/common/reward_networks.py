@@ -28,7 +28,8 @@ from experiments.common import agents, figures, runs
 from experiments.common.experiment import setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
-from sejax import ICMConfig
+from sejax import ICMConfig, ProxySet, Task
+from sejax.agents import AgentConfig, ExplorationConfig
 from sejax.options import ConfigError, Count, listed, registry, require_known
 from sejax.options.plain import flatten
 from sejax.proxies import reward
@@ -46,11 +47,12 @@ OBJECTIVES = tuple(registry.BUILT_IN["objective"])
 class Study:
     """What the paper trains on the RNs of a task."""
 
-    agent: Any  # of the rows with default and varied hyperparameters; None: that of `preset=best`
-    transfer_agent: Any  # of the row with an unseen agent
-    tuned_agent: Any = None  # on the real task for few steps, if it is another one
+    # Of the rows with default and varied hyperparameters; None: that of `preset=best`.
+    agent: AgentConfig | None
+    transfer_agent: AgentConfig  # of the row with an unseen agent
+    tuned_agent: AgentConfig | None = None  # on the real task for few steps, if it is another one
     rows: tuple[str, ...] = PAPER_ROWS  # of the figure
-    bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
+    bonuses: dict[str, ExplorationConfig]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
     max_episodes: int  # that the paper trains
     max_steps: int  # training steps that its figure shows
@@ -187,12 +189,12 @@ class RnSettings(RunSettings):
         return STUDIES[self.env]
 
     @property
-    def task(self) -> Any:
+    def task(self) -> Task:
         """The real task, with the physics and rewards that RNs are learned with."""
         return learning_config(self, self.variants[0], OBJECTIVES[0]).task()
 
     @property
-    def learning_agent(self) -> Any:
+    def learning_agent(self) -> AgentConfig:
         """The agent that RNs are learned with."""
         return learning_config(self, self.variants[0], OBJECTIVES[0]).agent
 
@@ -204,11 +206,11 @@ class RnSettings(RunSettings):
         return self.folder / "rns" if self.quick else Path("results/reward_networks")
 
 
-def learn(settings: RnSettings, variant: str, objective: str) -> Any:
+def learn(settings: RnSettings, variant: str, objective: str) -> ProxySet:
     """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)
-    known = len(there) if there else 0
-    if known < settings.learned:
+    if there is None or len(there) < settings.learned:
+        known = len(there) if there else 0
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
         path, missing = file_of(settings, variant, objective), settings.learned - known
@@ -236,7 +238,7 @@ def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
     return settings.rns_folder / settings.env / objective / f"{variant}.safetensors"
 
 
-def stored(settings: RnSettings, variant: str, objective: str) -> Any:
+def stored(settings: RnSettings, variant: str, objective: str) -> ProxySet | None:
     """The RNs that are there already, a `ProxySet`; None if they are to be learned.
 
     Raises:
@@ -260,7 +262,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     return there
 
 
-def _what_counts(config: Any) -> dict[str, Any]:
+def _what_counts(config: LearnConfig) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     counted = {"generations", "stop_when_solved"}
     free = {*config.free} - counted | {"num_parallel"}
@@ -275,13 +277,13 @@ def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
 
 
 @functools.cache
-def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
+def learning_config(settings: RnSettings, variant: str, objective: str) -> LearnConfig:
     """The configuration of the NES runs for a variant and objective.
 
     The scale of a network's output is the preset's for the preset's own variant, and 1 for others.
     """
     plain = variant.removesuffix(AUGMENTED)
-    preset = settings.learn_config(["proxy=rn"]).proxy
+    preset: Any = settings.learn_config(["proxy=rn"]).proxy
     scale = preset.output_scale if plain == preset.variant else 1.0
     return settings.learn_config(
         [

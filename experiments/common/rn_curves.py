@@ -19,6 +19,7 @@ from experiments.common.experiment import setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, TrainingConfig
+from sejax.agents import AgentConfig
 from sejax.options import Count, registry, require, require_known
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
@@ -70,7 +71,7 @@ class CurveSettings(RnSettings):
         must = f"must be at most learned={self.learned}; got {self.rns}"
         require(self.rns <= self.learned, "rns", must, fix=f"Set learned={self.rns}.")
 
-    def agent(self, row: str) -> Any:
+    def agent(self, row: str) -> AgentConfig:
         """The agent that is trained in a row."""
         if row == "transfer":
             return self.study.transfer_agent
@@ -101,7 +102,9 @@ def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
             yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
 
 
-def rn_curves(settings: CurveSettings, variant: str, rns: ProxySet, prefix: str = "") -> Any:
+def rn_curves(
+    settings: CurveSettings, variant: str, rns: ProxySet, prefix: str = ""
+) -> Iterator[pd.DataFrame]:
     """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(Condition.of_set, rns)
     return curves_in(settings, variant, len(rns), make, prefix)

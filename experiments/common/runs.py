@@ -24,6 +24,7 @@ from sejax.ops.scores import reaches
 from sejax.options import ConfigError, Count, require
 from sejax.runs import run_directory, session
 from sejax.runs.chunks import Chunks
+from sejax.runs.config import LearnConfig
 
 # With quick=true: a small SE and agents that learn enough to be seen moving.
 QUICK = (
@@ -55,7 +56,7 @@ class RunSettings(Settings):
     preset: str = setting("best")
     run: tuple[str, ...] = setting(())
 
-    def learn_config(self, overrides: Iterable[str]) -> Any:
+    def learn_config(self, overrides: Iterable[str]) -> LearnConfig:
         """The configuration of the NES runs with these overrides; those of `run` win."""
         quick = self.quick_run if self.quick else ()
         words = [f"env={self.env}", f"preset={self.preset}", *quick, *overrides]
@@ -65,7 +66,7 @@ class RunSettings(Settings):
         return dataclasses.replace(config, devices=self.devices, seed=self.seed)
 
 
-def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
+def configs_of(config: LearnConfig, num_runs: int, folder: Path) -> list[LearnConfig]:
     """Configurations of runs with the seeds from `config.seed` on, in folders of their own."""
     return [
         dataclasses.replace(config, seed=seed, run_dir=str(folder / f"seed{seed}"))
@@ -73,7 +74,9 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
     ]
 
 
-def learn(configs: list[Any], option: str = "work", chunks: Chunks | None = None) -> pd.DataFrame:
+def learn(
+    configs: list[LearnConfig], option: str = "work", chunks: Chunks | None = None
+) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
     Args:
@@ -104,9 +107,9 @@ def learn(configs: list[Any], option: str = "work", chunks: Chunks | None = None
     return pd.concat(curves, ignore_index=True)
 
 
-def collect(configs: list[Any], path: Path, before: Any = None) -> None:
+def collect(configs: list[LearnConfig], path: Path, before: Any = None) -> None:
     """Writes the best proxy of each run into one file, after those of the set `before`."""
-    sets = [*([before] if before else []), *(sejax.load_set(Path(x.run_dir)) for x in configs)]
+    sets = [*([before] if before else []), *(sejax.load_set(x.folder) for x in configs)]
     proxies = [proxy for each in sets for proxy in each]
     sejax.save_set(
         path,
