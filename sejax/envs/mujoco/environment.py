@@ -24,8 +24,7 @@ Scalars = dict[str, Float[Array, ""]]
 class MujocoTask(Options):
     """A task of Gymnasium: its options, which are keyword arguments there, and its equations.
 
-    A subclass sets the class attributes and defines `rewards`, `is_healthy`, `more_info` and
-    `observe`.
+    A subclass sets the class attributes, defines `rewards`, and overrides what else differs.
 
     Attributes:
       name: the task's name.
