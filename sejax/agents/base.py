@@ -79,19 +79,6 @@ class ActFn(Protocol):
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
 
 
-def require_agent(agent: "Agent", observation: Space, action: Space) -> None:
-    """Checks that it is an agent, and made for these spaces.
-
-    Raises:
-      ConfigError: if it is not.
-    """
-    fix = "Set agent=sejax.make_agent(config, task) with this task."
-    require_part("agent", Agent, agent, fix)
-    sizes = agent.spec.sizes
-    in_task = sizes_of(observation, action)
-    require(sizes in (None, in_task), "agent", f"must be made for {in_task}", got=sizes, fix=fix)
-
-
 @dataclass(frozen=True, kw_only=True)
 class AgentSpec:
     """What is known of an agent before it is compiled.
@@ -204,6 +191,19 @@ class Varied(NamedTuple):
 
     agents: tuple[Agent, ...]
     draw: Callable[[Array], Drawn]
+
+
+def require_agent(agent: Agent, observation: Space, action: Space) -> None:
+    """Checks that it is an agent, and made for these spaces.
+
+    Raises:
+      ConfigError: if it is not.
+    """
+    fix = "Set agent=sejax.make_agent(config, task) with this task."
+    require_part("agent", Agent, agent, fix)
+    sizes = agent.spec.sizes
+    in_task = sizes_of(observation, action)
+    require(sizes in (None, in_task), "agent", f"must be made for {in_task}", got=sizes, fix=fix)
 
 
 @dataclass(frozen=True, kw_only=True)
