@@ -40,7 +40,7 @@ def make_from(config: Makes[Task]) -> Task:
     """The task that a configuration describes, built once; its `origin` is the configuration."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
-        object.__setattr__(task, "origin", to_plain(config, "env"))
+        vars(task)["origin"] = to_plain(config, "env")
     return task
 
 
