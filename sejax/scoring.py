@@ -29,7 +29,7 @@ class Scores(struct.PyTreeNode):
       diverged: whether the agent of a training diverged; the incumbent's trainings come last.
     """
 
-    population: Float[Array, " evaluation"]
+    population: Float[Array, " on_candidates"]
     incumbent: Float[Array, " turn_agent"]
     agent_means: Float[Array, " agent"]
     incumbent_mean: Float[Array, ""]
@@ -67,7 +67,7 @@ class GenerationInfo(struct.PyTreeNode):
     train_episodes_mean: Array
     num_nonfinite: Array  # trainings that diverged
     by_agent: AgentInfo  # the same for each agent of a mixture
-    population_scores: Float[Array, " evaluation"]
+    population_scores: Float[Array, " on_candidates"]
     train_steps: Array  # `[training]` int32; sums may exceed 32 bits and are made on the host
     real_steps: Array  # in the same form: steps on the real task
     active: Array  # False if the run was over before this generation
@@ -88,7 +88,7 @@ class Scoring:
     def candidate_scores(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`.
 
-        The scores of a candidate's evaluations become one score here.
+        The scores of a candidate's trainings become one score here.
 
         Args:
           outcome: of all trainings, as returned by `sejax.generation.GenerationEvaluator`.
@@ -97,7 +97,7 @@ class Scoring:
         scores = self._scores(self.objective.search_scores(outcome))
         aggregate = jnp.mean if layout.strategy.eval_aggregate == "mean" else jnp.min
         by_candidate = scores.population.reshape(-1, layout.strategy.num_evals)
-        population = aggregate(by_candidate, axis=1)  # nan if the agent of one evaluation diverged
+        population = aggregate(by_candidate, axis=1)  # nan if the agent of one training diverged
         return layout.mixture.comparable(population, layout.candidate_indices, scores.agent_means)
 
     def shown_scores(self, outcome: Outcome) -> Scores:
@@ -174,7 +174,7 @@ class Scoring:
 
 
 def with_diverged_last(
-    scores: Float[Array, " turn"], population: Float[Array, " evaluation"]
+    scores: Float[Array, " turn"], population: Float[Array, " on_candidates"]
 ) -> tuple[Float[Array, " turn"], Float[Array, ""]]:
     """The incumbent's scores with one agent, diverged ones ranked last, and their mean.
 
