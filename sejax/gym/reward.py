@@ -59,7 +59,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], utils.RecordConstruct
     def __init__(self, env: Env, source: str | Path, discount: float | None = None):
         utils.RecordConstructorArgs.__init__(self, source=str(source), discount=discount)
         super().__init__(env)
-        _, weights, header = read(source, kinds=("rn",), single=True)
+        path, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = configure("proxy", header.config["proxy"])
         discount = header.discount if discount is None else discount
         self.discount = checked(discount, Fraction, "discount", header.discount)
@@ -68,7 +68,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], utils.RecordConstruct
         if weighs_info or self.config.augmented:  # the task's configuration has the keys
             rule = "must be of a task with a registered name, which says what info the RN reads"
             require(is_known("env", header.config["env"]), "source", rule, got=header.task)
-            spec = envs.spec_of(configured("env", header.config["env"], "source"))
+            spec = envs.spec_of(configured("env", header.config["env"], path.name))
             keys = spec.info_keys if weighs_info else spec.augmented_keys
         self._info_keys = [GYMNASIUM_NAMES.get(key, key) for key in keys]
         _require_task(env, header)

@@ -130,7 +130,7 @@ def configured(group: str, values: object, where: str) -> Any:
         try:
             return configure(group, values)
         except ConfigError as error:
-            error.rule += f" in {shortened(where, 40)}"
+            error.rule += f" in {shortened(where, 40)}" if error.details else ""
             raise
     name = values.get("name") if isinstance(values, Mapping) else "none"
     argument, word = GIVEN.get(group, (group, group))
