@@ -16,7 +16,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from experiments import null_baselines
@@ -25,16 +24,11 @@ from experiments.common.curves import on_grid
 ROOT = Path(__file__).parents[1]
 BLUE, GREY, ORANGE = "#2166ac", "#8c8c8c", "#d95f02"
 GRID = np.arange(1000, 20_001, 1000)
-SOURCES = {"by_hand": "controller by hand", "agent": "one {}", "best_of_four": "best of four {}"}
-COLORS = {
-    "controller by hand": "#009E73",
-    "one PPO": "#56B4E9",
-    "best of four PPO": "#0072B2",
-    "one DDQN": "#E69F00",
-    "best of four DDQN": "#B03A73",
-    "the evolved SE that ships": "#000000",
+SOURCES = {"by_hand": "controller by hand", "agent": "one {}", "best_of_four": "best of four {}s"}
+MARKERS = {  # label, mark, height, fill
+    "ddqn": ("DDQN", "o", 0.12, BLUE),
+    "td3_discrete": ("discrete TD3", "^", -0.12, "white"),
 }
-MARKERS = {"ddqn": ("o", ""), "td3_discrete": ("^", "white")}
 STYLES = {"a2c": "-", "ppo": "--"}
 BOXES = {
     "es": (0.5, 0.87, "evolution strategy\nperturbs the weights"),
@@ -91,36 +85,41 @@ def draw_agents(axes: Axes) -> None:
     )
     axes.set_xticks(range(0, 20_001, 5000))
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    axes.set_title("Agents on Acrobot")
+    axes.set_title("Agents trained on the SE, or on Acrobot")
     axes.legend(frameon=False, fontsize=8, loc="center right", bbox_to_anchor=(1, 0.6))
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw_costs(axes: Axes) -> None:
-    """Scores on SEs of CartPole against the real steps that each SE took."""
-    folders = {"cartpole-noise": SOURCES, "cartpole": {"evolved": "the evolved SE that ships"}}
+def draw_costs(costs: Axes, scores: Axes) -> None:
+    """What SEs of CartPole cost, the cheapest on top, and what agents learn on them."""
+    folders = {"cartpole-noise": SOURCES, "cartpole": {"evolved": "evolved (ships)"}}
+    returns: dict[tuple[float, str], dict[str, float]] = {}  # by the SE's real steps and name
     for folder, sources in folders.items():
         rows = pd.read_csv(ROOT / f"results/null_baselines/{folder}/rows.csv.xz")
         summary = null_baselines.summarise(null_baselines.NullBaselines(), rows)
         for row in summary[summary["hparams"] == "default"].itertuples():
-            name = sources.get(row.source, "").format(row.teacher.upper())
-            if name and row.kind in MARKERS:
-                mark, fill = MARKERS[row.kind]
-                spot = row.real_steps, row.test_return_mean
-                axes.plot(*spot, mark, color=COLORS[name], mfc=fill or COLORS[name], ms=8)
-    ses = [Line2D([], [], ls="", marker="s", color=x, label=name) for name, x in COLORS.items()]
-    agents = [
-        Line2D([], [], ls="", marker=mark, color="black", mfc=fill or "black", label=label)
-        for label, (mark, fill) in zip(("DDQN", "discrete TD3"), MARKERS.values(), strict=True)
-    ]
-    axes.axhline(195, color="black", linestyle="--", linewidth=0.8)
-    axes.text(4e7, 193, "solved", ha="right", va="top", fontsize=8)
-    axes.set(xscale="log", xlim=(1e3, 5e7), ylim=(120, 205))
-    axes.set(xlabel="real steps to make the SE", ylabel="return on the real CartPole")
-    shared = {"frameon": False, "fontsize": 8, "title_fontsize": 8, "alignment": "left"}
-    axes.add_artist(axes.legend(handles=agents, title="agents", loc=(0.45, 0.33), **shared))
-    axes.legend(handles=ses, title="SEs", loc="lower right", **shared)
-    axes.spines[["top", "right"]].set_visible(False)
+            if row.source in sources and row.kind in MARKERS:
+                name = sources[row.source].format(row.teacher.upper())
+                returns.setdefault((row.real_steps, name), {})[row.kind] = row.test_return_mean
+    ses = sorted(returns, reverse=True)
+    steps, names = zip(*ses, strict=True)
+    bars = costs.barh(names, steps, height=0.5, color=GREY)
+    costs.bar_label(bars, labels=[f"{x:,.0f}" for x in steps], padding=4, fontsize=9)
+    costs.set(xscale="log", xlim=(1e3, 1e9), xlabel="real steps to make it")
+    costs.set_xticks([1e3, 1e5, 1e7])
+    costs.set_title("An SE of CartPole")
+    for kind, (label, mark, shift, fill) in MARKERS.items():
+        heights = [i + shift for i, se in enumerate(ses) if kind in returns[se]]
+        means = [returns[se][kind] for se in ses if kind in returns[se]]
+        scores.plot(means, heights, mark, color=BLUE, mfc=fill, ms=7, label=label, clip_on=False)
+    scores.axvline(195, color="black", linestyle="--", linewidth=0.8)
+    scores.text(193, len(ses) - 0.6, "solved", ha="right", va="center", fontsize=9)
+    scores.set(xlim=(0, 200), ylim=(-0.5, len(ses) - 0.4), xlabel="return on the real CartPole")
+    scores.set_title("Agents that trained on it")
+    scores.legend(frameon=False, loc="center left")
+    for axes in (costs, scores):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(axis="y", length=0)
 
 
 figure, (loops, agents) = plt.subplots(1, 2, figsize=(9.2, 3.7), layout="constrained")
@@ -128,6 +127,6 @@ figure.get_layout_engine().set(wspace=0.08)
 draw_loops(loops)
 draw_agents(agents)
 figure.savefig(ROOT / "docs/overview.png", dpi=130)
-figure, costs = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
-draw_costs(costs)
+figure, (costs, scores) = plt.subplots(1, 2, sharey=True, figsize=(8.2, 3), layout="constrained")
+draw_costs(costs, scores)
 figure.savefig(ROOT / "docs/costs.png", dpi=130)
