@@ -191,9 +191,9 @@ def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, 
     assert changed == dataclasses.replace(config, generations=7)
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1",
-                                  "preset: other.yaml", "agent: {batch_size: {x: 1}}",
-                                  "1: 2", "\x00", "a: &a [1]\nb: &b [*a]"])  # fmt: skip
+@pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1", "1: 2",
+                                  "agent: {batch_size: {x: 1}}", "\x00", "a: &a [1]\nb: &b [*a]",
+                                  "preset: other.yaml", "{a: " * 60 + "{" + 61 * "}"])  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
     refused(f"preset={tmp_path / 'bad.yaml'}")

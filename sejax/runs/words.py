@@ -96,9 +96,7 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
     path = Path(with_home(texts.pop("preset")))
     typed = _tree(texts, groups)
     try:
-        text = path.read_text(encoding="utf-8")
-        require_flat_aliases(text)
-        values = flatten(yaml.safe_load(text))
+        values = flatten(read_yaml(path))
         file = _tree({CHOICES.get(name, name): x for name, x in values.items()}, groups)
         drop_other_choices(file, typed, groups)
         return drop_replaced(file, typed, is_whole=bool(CHOOSE_ALL & texts.keys())), typed
@@ -109,19 +107,26 @@ def trees_of(overrides: Sequence[str], groups: Collection[str]) -> tuple[Tree, T
         raise ConfigError("preset", rule, use="best") from error
 
 
-def require_flat_aliases(text: str) -> None:
-    """Raises `ValueError` for YAML whose aliases stand for values with aliases.
+def read_yaml(path: Path) -> Any:
+    """The values of a file of YAML.
 
-    A few lines of these can make billions of values; other aliases are as long as the file.
+    Raises:
+      OSError, ValueError, yaml.YAMLError: if it cannot be read, its values have many levels, or
+        its aliases stand for values with aliases. A few lines of these can make billions of values;
+        other aliases are as long as the file.
     """
+    text = path.read_text(encoding="utf-8")
     anchors: list[bool] = []  # of the open collections
     for event in yaml.parse(text):
+        if len(anchors) > 50:  # the time to read them grows with the square of their number
+            raise ValueError("its values have more than 50 levels")
         if isinstance(event, yaml.CollectionStartEvent):
             anchors.append(event.anchor is not None)
         elif isinstance(event, yaml.CollectionEndEvent):
             anchors.pop()
         elif isinstance(event, yaml.AliasEvent) and any(anchors):
             raise ValueError("it has aliases within what has an anchor")
+    return yaml.safe_load(text)
 
 
 def _tree(values: Mapping[str, Any], groups: Collection[str]) -> Tree:

@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from optuna import distributions, trial
 
 from sejax.options import ConfigError, as_text, nearest, require, shortened, told
 from sejax.options.plain import parsed, split
-from sejax.runs.words import UNREADABLE
+from sejax.runs.words import UNREADABLE, read_yaml
 
 FOLDER = Path(__file__).parent / "ranges"
 DIGITS = 6  # of a drawn number in its override: exactly this number is tried
@@ -142,7 +141,7 @@ def preset(name: str, agents: Mapping[str, str]) -> dict[str, Dimension]:
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     try:
-        texts = dict(yaml.safe_load(path.read_text(encoding="utf-8")))
+        texts = dict(read_yaml(path))
         with_agent = texts.pop("with_agent", None) or {}
         for group, agent in agents.items():
             for field, text in with_agent.get(agent, {}).items():
