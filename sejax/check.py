@@ -36,7 +36,7 @@ from sejax.envs.base import Task
 from sejax.myopia import ENOUGH, Judgement, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.ops.scores import reaches
-from sejax.options import LARGEST, Count, as_text, errors_of, registry, require
+from sejax.options import LARGEST, ConfigError, Count, as_text, registry, require
 from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -237,11 +237,15 @@ def _others(config: CheckConfig, task: Task) -> Agents:
     use = as_text([x for x in agents.fitting(task) if x not in known])
     rule = "must be none of its own agents"
     require(not again, "algorithms", rule, got=", ".join(sorted(again)), use=use)
-    with errors_of("agent", "algorithms"):
-        others = {x: configure("agent", {"name": x}) for x in names if x not in known}
-    for key, agent in (learned | others).items():
-        field = config.group_of(key) if key in learned else "algorithms"
-        agents.require_fit(agent, config.exploration, task, task.name, field)
+    try:
+        others = {x: configure("agent", {"name": x}, "algorithms") for x in names if x not in known}
+        for key, agent in (learned | others).items():
+            field = config.group_of(key) if key in learned else "algorithms"
+            agents.require_fit(agent, config.exploration, task, task.name, field)
+    except ConfigError as error:
+        if error.field == "algorithms" and "use" in error.details:
+            error.details["use"] = use  # one name is no list, and may be of its own agents
+        raise
     return others
 
 
