@@ -210,7 +210,7 @@ def test_a_bad_preset_file_is_one_message(tmp_path, text):
     ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),
     ("env.goal_reward=-1", "env.goal_reward", "env=cliff_walking"),
     ("acrobot", "an override", "env="), ("generations = 3", "an override", "generations=VALUE"),
-    ("generations.x=1", "generations", "{'x': '1'}"), ("agent.torso=conv", "agent.torso", ""),
+    ("generations.x=1", "generations", "{'x': '1'}"), ("agents.a.tau=1", "agents.a", "agent.FIELD"),
     ("es.score_transform=my_rank", "es.score_transform", "Set es.score_transform=rank."),
     ("es.score_transform=rank.py:f", "es.score_transform", "es.score_transform=rank:f."),
     ("agent=no_module_of:mine", "agent", "PYTHONPATH"), (f"agent=a:{'d' * 5000}", "agent", ""),

@@ -90,7 +90,8 @@ def configure(group: str, values: Any, where: str = "") -> Any:
     """
     is_choice = isinstance(values, Mapping) and isinstance(values.get("name"), str)
     where = where or group
-    require(is_choice, where, "must be a choice with its fields", got=values, use="NAME")
+    fix = f"Set {where}=NAME{', or agent.FIELD of an only agent' if group == 'agent' else ''}."
+    require(is_choice, where, "must be a choice with its fields", got=values, fix=fix)
     with errors_of(group, where):
         cls = registry.find(group, values["name"])
     known = defaults_of(cls)
