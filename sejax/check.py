@@ -36,7 +36,7 @@ from sejax.envs.base import Task
 from sejax.myopia import ENOUGH, Judgement, judge, verdict_of
 from sejax.ops.files import as_file_name, write_text
 from sejax.ops.scores import reaches
-from sejax.options import LARGEST, ConfigError, Count, as_text, registry, require
+from sejax.options import LARGEST, Count, as_text, registry, require
 from sejax.options.plain import configure, plugin, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact
@@ -231,21 +231,16 @@ def _others(config: CheckConfig, task: Task) -> Agents:
       ConfigError: if one of them, or of the proxy's agents, does not fit the task.
     """
     learned = config.agents
-    names = agents.fitting(task) if config.algorithms is None else config.algorithms
     known = {*learned, *(registry.name_of("agent", agent) for agent in learned.values())}
-    again = known & {*(config.algorithms or ())}
-    use = as_text([x for x in agents.fitting(task) if x not in known])
-    rule = "must be none of its own agents"
-    require(not again, "algorithms", rule, got=", ".join(sorted(again)), use=use)
-    try:
-        others = {x: configure("agent", {"name": x}, "algorithms") for x in names if x not in known}
-        for key, agent in (learned | others).items():
-            field = config.group_of(key) if key in learned else "algorithms"
-            agents.require_fit(agent, config.exploration, task, task.name, field)
-    except ConfigError as error:
-        if error.field == "algorithms" and "use" in error.details:
-            error.details["use"] = use  # one name is no list, and may be of its own agents
-        raise
+    fitting = [x for x in agents.fitting(task) if x not in known]
+    names = fitting if config.algorithms is None else config.algorithms
+    wrong = [x for x in names if x in known or (":" not in x and x not in fitting)]
+    rule = f"must be agents for {task.name} other than its own"
+    require(not wrong, "algorithms", rule, got=", ".join(wrong), use=as_text(fitting))
+    others = {x: configure("agent", {"name": x}, "algorithms") for x in names}
+    for key, agent in (learned | others).items():
+        field = config.group_of(key) if key in learned else "algorithms"
+        agents.require_fit(agent, config.exploration, task, task.name, field)
     return others
 
 
