@@ -44,11 +44,14 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any
     """Inverse of `pack`: tensors and manifest, after the checksum was verified.
 
     Raises:
-      ValueError: if a byte has changed, or it is another kind of file; the message says why.
+      ValueError: if a byte has changed, it is another kind of file, or the manifest has 50 levels;
+        the message says why.
     """
     try:
         end = 8 + int.from_bytes(data[:8], "little")
         manifest: dict[str, Any] = json.loads(json.loads(data[8:end])["__metadata__"][kind])
+        if f"\n{'':50}" in json.dumps(manifest, indent=1):  # too many levels to be shown
+            raise ValueError
         digest = manifest.pop("sha256").encode("ascii")
         blank = data.replace(digest, _BLANK.encode(), 1)
         tensors = load(data)

@@ -325,6 +325,7 @@ def save_set(
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
         data = checksummed.pack(tensors, header.KIND, vars(stored))
+        checksummed.unpack(data, header.KIND)  # raises if `load` will
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         rule = "must be plain values that sejax.load takes, with numbers for score and seed"
         use = "sejax.config(...).plain()"
