@@ -144,8 +144,13 @@ def listed(names: Collection[str]) -> str:
 
 def shortened(value: object, length: int = 80) -> str:
     """A value as text that leaves room for the rest of a message."""
-    text = "".join(x if x.isprintable() else repr(x)[1:-1] for x in str(value))
+    text = escaped(str(value))
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
+
+
+def escaped(text: str) -> str:
+    """A text of a file, whose line breaks and control characters a terminal would follow."""
+    return "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import yaml
 
-from sejax.options import require
+from sejax.options import escaped, require
 from sejax.options.plain import defaults_of, from_plain, to_plain
 from sejax.proxies import header, hub
 
@@ -181,18 +181,18 @@ def card_of(proxy: PretrainedProxy, source: str, license: str = "") -> str:
     if proxy.learning:
         plain["learning"].pop("command")  # the card shows it below
     facts = {name: plain[name] for name in _FACTS if plain[name] not in (None, "", {})}
-    values = vars(proxy) | {
+    values = {x: escaped(vars(proxy)[x]) for x in ("name", "kind", "task")} | {
         "front": json.dumps(license) if source.startswith(hub.SCHEME) else None,
         "tags": json.dumps(["reinforcement-learning", "jax", *_KINDS[kind], proxy.task]),
         **{name: "" if name == kind else None for name in _KINDS},
         "facts": yaml.safe_dump(facts, sort_keys=False).rstrip(),
-        "evaluations": "\n".join(map(_ROW.format, proxy.evaluations)) or None,
-        "command": proxy.learning and proxy.learning.command,
+        "evaluations": "\n".join(escaped(_ROW.format(x)) for x in proxy.evaluations) or None,
+        "command": proxy.learning and escaped(proxy.learning.command),
         "install": "With `pip install 'sejax[hub]'`:\n\n" if source.startswith(hub.SCHEME) else "",
         "gym": gym if kind == "se" else "",
         "call": call,
         "source": source,
-        "overrides": words,
+        "overrides": escaped(words),
         "license": license
         or "Apache-2.0, like sejax, which made it; it contains no data of others.",
     }
