@@ -95,7 +95,8 @@ def test_a_set_comes_back_and_parts_of_it_are_chosen_by_score_and_place(tmp_path
         chex.assert_trees_all_equal(proxy.params.weights, expected)
         assert proxy.record == record and proxy.params.discount == proxies.discount == 0.7
     assert refused(sejax.load, path) == "source"
-    assert refused(sejax.load_set, path, option="--ses", kind="se") == "--ses"
+    for kind, field in (("se", "--ses"), ("typo", "kind")):
+        assert refused(sejax.load_set, path, option="--ses", kind=kind) == field
     assert proxies.ranked(2).seeds.tolist() == [6, 7]
     assert proxies.ranked(2, worst=True).seeds.tolist() == [5, 7]
     sejax.save_set(tmp_path / "x", env, weights, [{"seed": 5}, *records[1:]], CONFIG, 0.7)

@@ -413,7 +413,7 @@ def load_set(
       task: as in `load`.
       proxy: as in `load`.
       option: name of `source` in messages.
-      kind: kind that the proxies must have, "se" or "rn"; None for any.
+      kind: kind that the proxies must have, such as "se"; None for any.
       single: whether the file must hold one proxy.
 
     Raises:
@@ -424,6 +424,8 @@ def load_set(
       >>> len(rns), rns[0].params.discount
       (1, 0.8)
     """
+    if kind is not None and ":" not in str(kind):  # of no module
+        require_known("kind", kind, registry.names("proxy"))
     stored = header.read(source, option, () if kind is None else (kind,), single)
     env = _env_of(stored, task, proxy, option)
     path, tensors, learned = stored
