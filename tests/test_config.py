@@ -192,7 +192,7 @@ def test_a_configuration_is_read_back_from_its_values_and_from_a_file(tmp_path, 
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "a: [", "env: 3", "proxy: [1]", "nope: 1", "1: 2",
-                                  "agent: {batch_size: {x: 1}}", "\x00", "a: &a [1]\nb: &b [*a]",
+                                  "agent: {batch_size: {x: 1}}", "\x00", "a: &a {}\nb: &b {c: *a}",
                                   "preset: other.yaml", "{a: " * 60 + "{" + 61 * "}"])  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
