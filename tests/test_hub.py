@@ -157,13 +157,12 @@ def front_and_card(the_hub, repo):
 
 
 def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
-    task = sejax.Task(name="mine\x1b", env=sejax.envs.make("cartpole").env, max_steps=10)
+    task = sejax.Task(name="my\x1b", env=sejax.envs.make("cartpole").env, max_steps=10)
     env = paper_se(hidden_size=2).make(task)
     sejax.save(tmp_path / "mine.safetensors", env, env.init_weights(jax.random.key(0)))
     address = sejax.push(tmp_path / "mine.safetensors", "me/mine")
     _, card = front_and_card(the_hub, "me/mine")
-    said = ('sejax.load("hf://me/mine", task=...)', "env=...", r"`mine\x1b`")
-    assert all(text in card for text in said)
+    assert all(x in card for x in ('sejax.load("hf://me/mine", task=...)', "env=...", r"`my\x1b`"))
     assert sejax.load(address, task=task)[0].task is task
 
 

@@ -149,7 +149,7 @@ def shortened(value: object, length: int = 80) -> str:
 
 
 def escaped(text: str) -> str:
-    """A text of a file, whose line breaks and control characters a terminal would follow."""
+    """A text on one line, its line breaks and control characters written out."""
     return "".join(x if x.isprintable() else repr(x)[1:-1] for x in text)
 
 
