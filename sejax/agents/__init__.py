@@ -5,7 +5,6 @@ the hyperparameters that compiled programs take as arguments, and the buffers.
 """
 
 import dataclasses
-import functools
 
 from sejax.agents.base import Agent as Agent
 from sejax.agents.base import AgentConfig as AgentConfig
@@ -65,25 +64,26 @@ def make_agent(
     require_part("task", TaskSpec, task, "Set task to env.task, or sejax.Task(name=..., env=env).")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
-    make = _make_once if registry.is_hashable((config, exploration)) else _make_agent
-    return make(config, task, exploration, varied)
+    return registry.make("agent", _Whole(config, exploration, varied), task)
 
 
-def _make_agent(
-    config: AgentConfig, task: Task, exploration: ExplorationConfig, varied: bool
-) -> Agent:
-    """`make_agent` without its checks and without its memory of agents already made."""
+@dataclasses.dataclass(frozen=True)
+class _Whole:
+    """All that an agent is made of; it is remembered by these."""
 
-    def make(config: AgentConfig) -> Agent:
-        agent = registry.make("agent", config, task)
-        agent = registry.make("exploration", exploration, agent, task)
+    config: AgentConfig
+    exploration: ExplorationConfig
+    varied: bool
+
+    def make(self, task: Task) -> Agent:
+        if self.varied:
+            return make_varied(
+                self.config, lambda config: make_agent(config, task, self.exploration)
+            )
+        agent = registry.make("agent", self.config, task)
+        agent = registry.make("exploration", self.exploration, agent, task)
+        sizes = sizes_of(task.observation, task.action)
         return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, sizes=sizes))
-
-    sizes = sizes_of(task.observation, task.action)
-    return make_varied(config, make) if varied else make(config)
-
-
-_make_once = functools.cache(_make_agent)
 
 
 def require_fit(

@@ -30,7 +30,7 @@ import functools
 import importlib.metadata
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pkgutil import resolve_name
 from typing import Any, NamedTuple, Protocol, TypeVar, cast, overload, runtime_checkable
 
@@ -256,25 +256,21 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     cls = resolve_name(GROUPS[group].makes)
     if isinstance(config, cls | type) or not isinstance(config, Makes):
         return require_part(group, cls, config)
-    key = (group, config if is_hashable(config) else id(config), *arguments)
+    try:
+        hash(config)
+        key = (group, config, *arguments)
+    except TypeError:
+        key = (group, id(config), *arguments)
     if key not in _PARTS:
         part = config.make(*arguments)
-        got = f"{type(part).__name__} from {name_of(group, config)}"
-        require(isinstance(part, cls), group, f"must make a sejax.{cls.__name__}", got=got)
+        if not isinstance(part, cls):
+            got = f"{type(part).__name__} from {name_of(group, config)}"
+            raise ConfigError(group, f"must make a sejax.{cls.__name__}", got=got)
         _PARTS[key] = config, part  # while config is kept, no other object gets its id
     return cast(T, _PARTS[key][1])
 
 
 _PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
-
-
-def is_hashable(config: object) -> bool:
-    """Whether a configuration can be a key, as a frozen dataclass of hashable values can."""
-    try:
-        hash(config)
-    except TypeError:
-        return False
-    return True
 
 
 def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
@@ -346,7 +342,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     fields = []
     for p in options:
         field: Any = dataclasses.field() if p.default is p.empty else p.default
-        if not is_hashable(p.default):  # such as a list
+        if not isinstance(p.default, Hashable):  # such as a list
             field = dataclasses.field(default_factory=functools.partial(copy.copy, p.default))
         fields.append((p.name, Any if p.annotation is p.empty else p.annotation, field))
     base = resolve_name(GROUPS[group].base)
