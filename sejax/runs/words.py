@@ -69,9 +69,10 @@ def texts_of(overrides: Sequence[str]) -> dict[str, str]:
             raise ConfigError("an override", "must read FIELD=VALUE", got=override, fix=fix)
         first, *others = split(text)
         is_open = text.startswith("[") and not text.endswith("]")
-        use = shortened(f"{text.rstrip(',')}]" if is_open else first)
-        rule = "must be one value; a list stands in brackets, without spaces"
-        require(not (others or is_open), name, rule, got=text, use=use)
+        if others or is_open:
+            use = shortened(f"{text.rstrip(',')}]" if is_open else first)
+            rule = "must be one value; a list stands in brackets, without spaces"
+            raise ConfigError(name, rule, got=text, use=use)
         texts[CHOICES.get(name, name)] = text
     return texts
 
