@@ -27,14 +27,14 @@ from sejax.distill.policy_search import PolicySearchConfig, search_policies
 from sejax.distill.teaching import diverged_last, grades, students
 from sejax.ops.files import as_file_name, write_text
 from sejax.options import Count, registry, require
-from sejax.options.plain import defaults_of, flatten, from_plain, merge, plugin
+from sejax.options.plain import configure, defaults_of, flatten, from_plain, merge, plugin
 from sejax.proxies import header, zoo
 from sejax.proxies.exact import make_exact, require_vectors
 from sejax.proxies.io import save
 from sejax.proxies.synthetic import SyntheticConfig
 from sejax.runs import commands
 from sejax.runs.command_config import PLACES, CommandConfig
-from sejax.runs.config import LearnConfig, env_in
+from sejax.runs.config import LearnConfig
 from sejax.runs.store import Store
 from sejax.runs.words import Tree, agent_names
 from sejax.training import TrainingConfig
@@ -93,7 +93,7 @@ class DistillConfig(CommandConfig):
         """
         known = defaults_of(cls)
         typed = {"preset": cls.preset} | {name: x for name, x in typed.items() if name in known}
-        env = env_in(typed)
+        env = configure("env", registry.DEFAULTS["env"] | typed.get("env", {}))
         actions = envs.spec_of(env).actions
         if not agent_names(typed["agents"]):
             students = {name: {"name": name} for name in agents.USUAL[actions]}

@@ -67,7 +67,7 @@ def to_plain(value: object, group: str | None = None) -> Any:
 
 def plugin(group: str) -> Any:
     """A dataclass field with a plugin's configuration; the default is sejax's own first plugin."""
-    factory = functools.partial(configure, group, {"name": registry.names(group)[0]})
+    factory = functools.partial(configure, group, registry.DEFAULTS[group])
     return dataclasses.field(default_factory=factory, metadata={"plugin": group})
 
 
@@ -145,16 +145,14 @@ def require_typed(values: Mapping[str, Any], typed: Mapping[str, Any] | None = N
       ConfigError: for the first field of `NAMES_CODE` that names another one.
     """
     rule = "must be typed, as names in files are never imported"
-    known = code_in(typed or {}).values()
-    for name, text in code_in(values).items():
-        if ":" in text and text not in known:
+    known, stored = (
+        {k: str(x) for k, x in flatten(tree).items() if k.rpartition(".")[2] in NAMES_CODE}
+        for tree in (typed or {}, values)
+    )
+    for name, text in stored.items():
+        if ":" in text and text not in known.values():
             use = f"{shortened(text, 60)}, if you trust it"
             raise ConfigError(name.removesuffix(".name"), rule, got=text, use=use)
-
-
-def code_in(values: Mapping[str, Any]) -> dict[str, str]:
-    """The texts of fields of `NAMES_CODE` in nested plain values."""
-    return {k: str(x) for k, x in flatten(values).items() if k.rpartition(".")[2] in NAMES_CODE}
 
 
 def defaults_of(cls: type) -> dict[str, Any]:
@@ -198,7 +196,7 @@ def _read(value: Any, hint: Any, name: str, default: Any, group: str | None) -> 
         return {str(k): _read(value[k], of_key, names[k], MISSING, group) for k in names}
     if group:
         if isinstance(value, Mapping) and default is not MISSING:
-            value = {"name": registry.name_of(group, default), **value}
+            value = {**registry.DEFAULTS[group], **value}
         return configure(group, value, name)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
         rule = f"must have fields, as {name}.{next(iter(defaults_of(hint)), 'name')}"

@@ -82,7 +82,7 @@ GROUPS = {
     ),
 }
 _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
-# Names that come with sejax. A group's first name is chosen if nothing else makes a choice.
+# Names that come with sejax.
 BUILT_IN = {
     "env": {
         "cartpole": "sejax.envs.classic:CartPole",
@@ -137,6 +137,8 @@ BUILT_IN = {
     },
     "machines": {"local": "sejax.runs.chunks:LocalConfig", "ray": "sejax.runs.ray:RayConfig"},
 }
+# What is chosen if nothing else makes a choice: a group's first name.
+DEFAULTS = {group: {"name": next(iter(known))} for group, known in BUILT_IN.items()}
 # Beginnings of names of tasks: a dataclass with a field `name` serves all names that begin so.
 PREFIXES = {"gymnax/": "sejax.envs.gymnax:GymnaxTask"}
 

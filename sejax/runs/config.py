@@ -17,7 +17,7 @@ from sejax.options import ConfigError, Count, Options, old, registry, require
 from sejax.options.plain import configure, merge, plugin, require_typed, unknown_field
 from sejax.proxies import ProxyConfig
 from sejax.runs.command_config import PLACES, CommandConfig
-from sejax.runs.presets import choice_in, preset_of
+from sejax.runs.presets import preset_of
 from sejax.runs.trackers import Tracker
 from sejax.runs.words import Tree, agent_names
 
@@ -158,7 +158,7 @@ class LearnConfig(CommandConfig):
         """The choice of agents, and the preset."""
         names = agent_names(typed["agents"])
         if not names:
-            default = default_agent(typed)
+            default = default_agent(typed.get("env", {}))
             names = {default: default}
         of_agents = {"agents": {key: {"name": name} for key, name in names.items()}}
         preset = preset_of(merge(of_agents, typed))
@@ -192,17 +192,9 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
     return LearnConfig.of_words(overrides)
 
 
-def default_agent(tree: Tree) -> str:
-    """The default agent of a tree's task."""
+def default_agent(env: Tree) -> str:
+    """The default agent of a task, by its name and fields."""
     with contextlib.suppress(ConfigError):  # making the task raises it again
-        return agents.default_for(envs.spec_of(env_in(tree)))
-    return registry.names("agent")[0]
-
-
-def env_in(tree: Tree) -> Any:
-    """The configuration of a tree's task.
-
-    Raises:
-      ConfigError: if the tree describes no task that may be made.
-    """
-    return configure("env", {"name": choice_in(tree, "env")} | tree.get("env", {}))
+        config = configure("env", registry.DEFAULTS["env"] | env)
+        return agents.default_for(envs.spec_of(config))
+    return registry.DEFAULTS["agent"]["name"]

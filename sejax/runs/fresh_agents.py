@@ -102,7 +102,7 @@ class FreshAgentsConfig(CommandConfig):
         # Agents take the hyperparameters of the proxy's of their name; of several, of their key's.
         known = learned["agents"] if learned and asked is None else {}
         if not names:
-            task = {"env": {"name": typed.get("env", "cartpole")}}
+            task = {"name": typed.get("env", "cartpole")}
             name = agents.default_for(stored.spec) if stored else default_agent(task)
             names = {name: name}
         of_agents: Tree = {}

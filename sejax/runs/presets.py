@@ -44,7 +44,7 @@ def _sections_in(stem: str, known: dict[str, Tree]) -> dict[str, Tree]:
 
 def choice_in(tree: Tree, group: str) -> str:
     """The name of a group's choice in a tree; sejax's own first one if the tree has none."""
-    return str(tree.get(group, {}).get("name", registry.names(group)[0]))
+    return str((registry.DEFAULTS[group] | tree.get(group, {}))["name"])
 
 
 def preset_of(typed: Tree) -> Tree:
