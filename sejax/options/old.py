@@ -28,18 +28,14 @@ def upgraded(config: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(agent := new.get("agent"), Mapping) and isinstance(agent.get("name"), str):
         new["agents"] = {registry.key_of(agent["name"]): new.pop("agent")}
     agents = new.setdefault("agents", {})
-    if isinstance(agents, Mapping) and "mixture" not in new:
-        new |= _split_mixture(agents)
-    return new
-
-
-def _split_mixture(agents: Mapping[str, Any]) -> dict[str, Any]:
-    """The agents, and beside them the settings of their mixture that stood among them."""
+    if not isinstance(agents, Mapping) or "mixture" in new:
+        return new
     of_all = {name: agents[name] for name in ("aggregate", "compared_by") if name in agents}
     by_key = {key: dict(x) for key, x in agents.items() if isinstance(x, Mapping)}
     weights = {}
     if len(by_key) > 1:  # an only agent may have a field of this name
         weights = {key: x.pop("weight") for key, x in by_key.items() if "weight" in x}
-    mixture = {"mixture": of_all | {"weights": weights}} if of_all or weights else {}
-    others = {key: x for key, x in agents.items() if key not in of_all}
-    return mixture | {"agents": others | by_key}
+    if of_all or weights:
+        new["mixture"] = of_all | {"weights": weights}
+    new["agents"] = {key: x for key, x in agents.items() if key not in of_all} | by_key
+    return new
