@@ -15,7 +15,7 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, cast
 
 import jax
@@ -113,9 +113,8 @@ class PPOConfig(AgentOptions):
         is_small = self.rollout_steps is not None and (
             self.hidden_size * (self.rollout_steps // self.num_minibatches) <= cpu.SMALL_PRODUCT
         )
-        return replace(
-            super().spec(),
-            learns_from=0,
+        return AgentSpec(
+            stops_from=self.warmup_episodes,
             action_repeat=self.action_repeat,
             cpu_num_parallel=cpu.SMALL_NUM_PARALLEL if is_small else 1,
         )
