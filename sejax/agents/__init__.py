@@ -23,7 +23,7 @@ from sejax.agents.buffers import rollout_buffer as rollout_buffer
 from sejax.agents.varied import make_varied
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec, sizes_of
-from sejax.options import ConfigError, registry, require
+from sejax.options import ConfigError, registry
 from sejax.options.registry import require_part
 
 # The usual agents by actions: first a task's default, last the one that often learns fastest.
@@ -109,9 +109,9 @@ def require_fit(
         known = fitting(spec) or ["MODULE:NAME"]
         rule = f"must be one of {', '.join(known)} in {task_name}"
         raise ConfigError(field, rule, got=registry.name_of("agent", agent), use=known[0])
-    is_fit = exploration.states is None or agent.states in (None, exploration.states)
-    got = registry.name_of("exploration", exploration)
-    require(is_fit, "exploration", f"must be for {agent.states} states", got=got, use="none")
+    if exploration.states is not None and agent.states not in (None, exploration.states):
+        got = registry.name_of("exploration", exploration)
+        raise ConfigError("exploration", f"must be for {agent.states} states", got=got, use="none")
 
 
 def default_for(spec: TaskSpec) -> str:
