@@ -77,9 +77,7 @@ class _Whole:
 
     def make(self, task: Task) -> Agent:
         if self.varied:
-            return make_varied(
-                self.config, lambda config: make_agent(config, task, self.exploration)
-            )
+            return make_varied(self.config, lambda x: make_agent(x, task, self.exploration))
         agent = registry.make("agent", self.config, task)
         agent = registry.make("exploration", self.exploration, agent, task)
         sizes = sizes_of(task.observation, task.action)
