@@ -64,12 +64,12 @@ def make_agent(
     require_part("task", TaskSpec, task, "Set task to env.task, or sejax.Task(name=..., env=env).")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
-    return registry.make("agent", _Whole(config, exploration, varied), task)
+    return registry.make("agent", _AgentParts(config, exploration, varied), task)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Whole:
-    """All that an agent is made of; it is remembered by these."""
+class _AgentParts:
+    """All that an agent is made of: equal parts give one agent."""
 
     config: AgentConfig
     exploration: ExplorationConfig
