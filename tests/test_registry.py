@@ -76,10 +76,9 @@ class Torso(AgentConfig):
 def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
     task = envs.make("cliff_walking")
     assert sejax.make_agent(Torso(), task) is sejax.make_agent(Torso(torso=nn.Dense(8)), task)
-    unhashable = Torso(sizes=[1, 2])  # the same as itself alone
-    first = registry.make("agent", unhashable, task)
-    assert registry.make("agent", unhashable, task) is first
-    assert registry.make("agent", unhashable, envs.make("gridworld_2x2")) is not first
+    unhashable, other = Torso(sizes=[1, 2]), envs.make("gridworld_2x2")
+    first, again, elsewhere = (sejax.make_agent(unhashable, x) for x in (task, task, other))
+    assert first is again and first is not elsewhere  # the same as itself alone
     variants = [
         {}, {"torso": nn.DenseGeneral(8)}, {"torso": nn.Dense(9)}, {"rate": 2.0}, {"act": sum},
         {"torso": nn.Dense(8, dtype=jnp.float16)}, {"sizes": [1, 2]}, {"sizes": (1, 3)},

@@ -64,22 +64,20 @@ def make_agent(
     require_part("task", TaskSpec, task, "Set task to env.task, or sejax.Task(name=..., env=env).")
     require_part("exploration", ExplorationConfig, exploration, "Pass one, such as ICMConfig().")
     require_fit(config, exploration, task, task.name)
-    return registry.make("agent", _AgentParts(config, exploration, varied), task)
+    return registry.make("agent", _WholeAgent(varied), config, exploration, task)
 
 
 @dataclasses.dataclass(frozen=True)
-class _AgentParts:
-    """All that an agent is made of: equal parts give one agent."""
+class _WholeAgent:
+    """Makes an agent of all its parts: equal parts give one agent."""
 
-    config: AgentConfig
-    exploration: ExplorationConfig
     varied: bool
 
-    def make(self, task: Task) -> Agent:
+    def make(self, config: AgentConfig, exploration: ExplorationConfig, task: Task) -> Agent:
         if self.varied:
-            return make_varied(self.config, lambda x: make_agent(x, task, self.exploration))
-        agent = registry.make("agent", self.config, task)
-        agent = registry.make("exploration", self.exploration, agent, task)
+            return make_varied(config, lambda x: make_agent(x, task, exploration))
+        agent = registry.make("agent", config, task)
+        agent = registry.make("exploration", exploration, agent, task)
         sizes = sizes_of(task.observation, task.action)
         return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, sizes=sizes))
 

@@ -258,21 +258,26 @@ def make(group: str, config: T | Makes[T], *arguments: Any) -> T:
     cls = resolve_name(GROUPS[group].makes)
     if isinstance(config, cls | type) or not isinstance(config, Makes):
         return require_part(group, cls, config)
-    try:
-        hash(config)
-        key = (group, config, *arguments)
-    except TypeError:
-        key = (group, id(config), *arguments)
+    key = (group, *map(_key, (config, *arguments)))
     if key not in _PARTS:
         part = config.make(*arguments)
         if not isinstance(part, cls):
             got = f"{type(part).__name__} from {name_of(group, config)}"
             raise ConfigError(group, f"must make a sejax.{cls.__name__}", got=got)
-        _PARTS[key] = config, part  # while config is kept, no other object gets its id
-    return cast(T, _PARTS[key][1])
+        _PARTS[key] = config, arguments, part  # while these are kept, no others get their ids
+    return cast(T, _PARTS[key][-1])
 
 
-_PARTS: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+_PARTS: dict[tuple[Any, ...], tuple[Any, ...]] = {}
+
+
+def _key(value: object) -> object:
+    """The value, or its id if it cannot be hashed."""
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return value
 
 
 def require_part(group: str, cls: type[T], part: object, fix: str = "") -> T:
