@@ -222,6 +222,7 @@ def test_tensors_that_are_not_the_networks_are_one_message(path):
 @pytest.mark.parametrize("given, field", [
     ({"weights": {"potential": {}}}, "weights"), ({"discount": None}, "discount"),
     ({"discount": 5.0}, "discount"), ({"score": "high"}, "config"),
+    ({"x": functools.reduce(lambda x, _: [x], range(5000), 0)}, "config"),
     ({"config": sejax.NESConfig()}, "config"), ({"config": {"es": sejax.NESConfig()}}, "config"),
 ])  # fmt: skip
 def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, field):

@@ -326,7 +326,7 @@ def save_set(
         )
         data = checksummed.pack(tensors, header.KIND, vars(stored))
         checksummed.unpack(data, header.KIND)  # raises if `load` will
-    except (LookupError, ValueError, TypeError, AttributeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, RecursionError) as error:
         rule = "must be plain values that sejax.load takes, with numbers for score and seed"
         use = "sejax.config(...).plain()"
         raise ConfigError("config", f"and record {rule}", got=told(error), use=use) from error
